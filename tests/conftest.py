@@ -168,7 +168,7 @@ def set_threads(monkeypatch) -> Iterator[Callable[[int], None]]:
 
     def set_to(num: int) -> None:
         numba.set_num_threads(min(num, available))
-        monkeypatch.setattr(os, "cpu_count", lambda: num)
+        monkeypatch.setattr("splatseed.progress.available_cpus", lambda: num)
 
     yield set_to
     numba.set_num_threads(available)

@@ -28,10 +28,10 @@ SOURCE = Path(splatseed.__file__).parent
 MODULES = ["splatseed"] + [m.name for m in pkgutil.walk_packages(splatseed.__path__, "splatseed.")]
 
 ORDER = (
-    "errors", "text", "settings", "requirements", "progress", "frozen", "runtime", "camera",
-    "similarity", "lens", "pointcloud", "depthmap", "scene", "scores", "io", "photos", "depth",
-    "methods", "seeding", "synthetic", "sfm", "rendering", "splat", "training", "integrations",
-    "viewer", "bench", "console", "commands", "cli",
+    "errors", "text", "settings", "requirements", "findings", "progress", "frozen", "sampling",
+    "projection", "runtime", "camera", "similarity", "lens", "pointcloud", "depthmap", "scene",
+    "scores", "io", "photos", "depth", "methods", "seeding", "synthetic", "sfm", "rendering",
+    "splat", "training", "integrations", "viewer", "bench", "console", "commands", "cli",
 )  # fmt: skip
 """Parts of the package: each imports only parts before it, or itself."""
 

@@ -1,11 +1,12 @@
 from __future__ import annotations
 
+import os
 import threading
 import time
 
 import pytest
 
-from splatseed.progress import blocks, in_threads, silent
+from splatseed.progress import blocks, in_threads, num_threads, silent, thread_limit
 
 
 def test_blocks_cover_the_range_and_report_each_end():
@@ -55,3 +56,12 @@ def test_an_error_in_a_thread_comes_out():
 
     with pytest.raises(ValueError, match="at 50"):
         in_threads(work, 100, 10, "stage", silent)
+
+
+def test_threads_are_one_per_available_cpu_or_the_limit(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 3}, raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    assert num_threads() == 2
+    limit = thread_limit.set(1)
+    assert num_threads() == 1
+    thread_limit.reset(limit)

@@ -14,7 +14,6 @@ from benchmarks.common.markdown import table
 
 from splatseed.camera import Camera
 from splatseed.errors import SplatseedError
-from splatseed.photos.projection import cells_from_world, grid_shape
 from splatseed.photos.view import View
 from splatseed.photos.viewpoint import look_at
 from splatseed.photos.visibility import SURFACE
@@ -62,7 +61,7 @@ def numpy_share(views: Sequence[View], xyz: np.ndarray) -> float:
 
 
 def _numpy_cells(view: View, xyz: np.ndarray) -> np.ndarray:
-    (rows, cols), m = grid_shape(view.camera, CELL), cells_from_world(view.camera, CELL)
+    (rows, cols), m = view.camera.grid_shape(CELL), view.camera.cells_from_world(CELL)
     x, y, depth = m[:, :3] @ xyz.T.astype(np.float64) + m[:, 3:]
     with np.errstate(divide="ignore", invalid="ignore"):
         j, i = np.floor(x / depth), np.floor(y / depth)

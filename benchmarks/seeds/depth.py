@@ -32,7 +32,7 @@ import splatseed as ss
 from splatseed.depth.alignment import map_camera
 from splatseed.errors import SceneNotFoundError
 from splatseed.io import find_depths
-from splatseed.photos.cache import user_cache_dir
+from splatseed.photos.loading import user_cache_dir
 from splatseed.progress import in_threads, silent
 from splatseed.scene import Scene
 

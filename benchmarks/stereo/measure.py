@@ -22,7 +22,7 @@ from benchmarks.stereo.speed import NUM_VIEWS, prepare_views
 from benchmarks.stereo.truth import TRUE_SCENES, Score, prepare
 
 from splatseed.errors import ParameterError, SplatseedError
-from splatseed.photos.cache import user_cache_dir
+from splatseed.photos.loading import user_cache_dir
 
 __all__: list[str] = []
 

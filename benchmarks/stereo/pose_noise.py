@@ -31,7 +31,7 @@ import splatseed as ss
 from splatseed.camera import quat_from_rotation
 from splatseed.depth.stereo import stereo_depths
 from splatseed.errors import ReconstructionError, SplatseedError
-from splatseed.photos.cache import user_cache_dir
+from splatseed.photos.loading import user_cache_dir
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.seeding.pose_accuracy import estimate_pose_error

@@ -44,7 +44,7 @@ from matplotlib.patches import Rectangle
 
 import splatseed as ss
 from splatseed.errors import SplatseedError
-from splatseed.photos.cache import user_cache_dir
+from splatseed.photos.loading import user_cache_dir
 from splatseed.photos.view import View
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene

@@ -21,7 +21,7 @@ from benchmarks.common.markdown import table
 from benchmarks.upsampling import naive
 
 import splatseed as ss
-from splatseed.seeding.geometry_score import GeometryScore, far_share, measure, spacing
+from splatseed.seeding.geometry_score import GeometryScore, far_share, mean_spacing, measure
 from splatseed.synthetic import SHAPES, Surface
 from splatseed.synthetic.surfaces import SineSheet, plane, sine_sheet
 
@@ -94,10 +94,10 @@ def make_case(shape: str, surface: Surface, noise: float, num: int, seed: int) -
     """Draw the originals of a case; ``noise`` in units of their spacing."""
     rng = np.random.default_rng(seed)
     clean = sample_unevenly(surface, num, rng, TEXTURE_PATCH)
-    xyz = clean + rng.normal(scale=noise * spacing(clean), size=clean.shape)
+    xyz = clean + rng.normal(scale=noise * mean_spacing(clean), size=clean.shape)
     originals = ss.PointCloud(xyz.astype(np.float32), np.full((num, 3), 128, np.uint8))
     samples = surface.sample(COVERAGE_SAMPLES, rng)
-    return Case(shape, seed, surface, originals, samples, spacing(originals.xyz))
+    return Case(shape, seed, surface, originals, samples, mean_spacing(originals.xyz))
 
 
 def make_cases(settings: Settings) -> Iterator[Case]:

@@ -23,7 +23,7 @@ from PIL import Image as PillowImage, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter
 
 import splatseed as ss
-from splatseed.depth.alignment import align
+from splatseed.depth.alignment import align_maps
 from splatseed.io import find_depths
 from splatseed.io.depth_maps import depth_folder
 from splatseed.io.staging import atomic_file
@@ -31,7 +31,7 @@ from splatseed.methods import methods_for
 from splatseed.photos.viewpoint import choose_camera, choose_image, look_at
 from splatseed.photos.visibility import find_visibility
 from splatseed.scene import Image
-from splatseed.seeding.geometry_score import spacing
+from splatseed.seeding.geometry_score import mean_spacing
 from splatseed.synthetic import Capture, make_capture, write_capture
 from splatseed.viewer.maps import preview_depth
 from splatseed.viewer.points import render_points
@@ -79,7 +79,7 @@ def draw_overview(capture: Capture, clouds: Mapping[str, ss.PointCloud]) -> None
 def draw_errors(capture: Capture, clouds: Mapping[str, ss.PointCloud]) -> None:
     """Every method's new points, coloured by their distance to the true surfaces."""
     originals = capture.scene.points
-    h = spacing(originals.xyz)
+    h = mean_spacing(originals.xyz)
     colored = {}
     for name, cloud in clouds.items():
         new = cloud.select(slice(len(originals), None))
@@ -102,7 +102,7 @@ def draw_depth() -> None:
             for name in depths:
                 writer.write(name, as_predicted(depths.read(name).values, rng))
         scene = scene.replace(depths=find_depths(scene, maps))
-        preview_depth(scene, align(scene), HERE / "depth_check.png")
+        preview_depth(scene, align_maps(scene), HERE / "depth_check.png")
     with PillowImage.open(HERE / "depth_check.png") as picture:
         smaller = picture.convert("RGB").reduce(2).quantize(200)
     smaller.save(HERE / "depth_check.png", optimize=True)

@@ -8,6 +8,7 @@ which ``Camera`` ignores.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ from jaxtyping import Float, Float64
 
 from splatseed.errors import SceneFormatError
 from splatseed.frozen import read_only
+from splatseed.projection import camera_centers, normalized, project
 
 
 class CameraModel(NamedTuple):
@@ -188,13 +190,31 @@ class Camera:
         """The inverse of ``cam_from_world``, by the rigid formula."""
         inverse = np.eye(4)
         inverse[:3, :3] = self.cam_from_world[:3, :3].T
-        inverse[:3, 3] = -inverse[:3, :3] @ self.cam_from_world[:3, 3]
+        inverse[:3, 3] = self.center
         return inverse
 
     @property
     def center(self) -> Float64[np.ndarray, " 3"]:
         """The camera's position in the world."""
-        return self.world_from_cam[:3, 3]
+        return np.asarray(camera_centers([self.cam_from_world])[0])
+
+    @property
+    def pixels_from_world(self) -> Float64[np.ndarray, "3 4"]:
+        """The matrix K cam_from_world, with which ``projection.project`` gives pixels."""
+        return np.asarray(self.K @ self.cam_from_world[:3])
+
+    def grid_shape(self, cell: float) -> tuple[int, int]:
+        """Rows and columns of the cells, at most ``cell`` pixels wide, that divide the image.
+
+        All cells are equal: a little smaller than ``cell`` where it does not divide the size.
+        """
+        return math.ceil(self.height / cell), math.ceil(self.width / cell)
+
+    def cells_from_world(self, cell: float) -> Float64[np.ndarray, "3 4"]:
+        """The matrix to cells: cell (i, j) spans rows i to i + 1 and columns j to j + 1."""
+        rows, cols = self.grid_shape(cell)
+        cells_from_pixels = np.diag([cols / self.width, rows / self.height, 1.0])
+        return np.asarray(cells_from_pixels @ self.K @ self.cam_from_world[:3])
 
     def project(
         self, xyz: Float[np.ndarray, "N 3"]
@@ -203,21 +223,21 @@ class Camera:
 
         Pixel coordinates are NaN for depths of 0 or less.
         """
-        rotation, translation = self.cam_from_world[:3, :3], self.cam_from_world[:3, 3]
-        cam = np.asarray(xyz, np.float64) @ rotation.T + translation
-        depth = cam[:, 2]
-        safe = np.where(depth > 0, depth, np.nan)
-        uv = (cam / safe[:, None]) @ self.K[:2].T
+        column, row, depth = project(self.pixels_from_world, xyz)
+        uv = np.stack([column, row], axis=1)
+        uv[~(depth > 0)] = np.nan
         return uv, depth
+
+    def rays(self, uv: Float[np.ndarray, "*B 2"]) -> Float64[np.ndarray, "*B 3"]:
+        """Return world directions through pixel coordinates ``uv``, with unit z in camera axes."""
+        x, y = np.moveaxis(normalized(self.K, uv), -1, 0)
+        return np.stack([a * x + b * y + c for a, b, c in self.cam_from_world[:3, :3].T], axis=-1)
 
     def unproject(
         self, uv: Float[np.ndarray, "N 2"], depth: Float[np.ndarray, " N"]
     ) -> Float64[np.ndarray, "N 3"]:
         """Return the world points at pixel coordinates ``uv`` and planar z-depths ``depth``."""
-        rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1) @ np.linalg.inv(self.K).T
-        cam = rays * np.asarray(depth, np.float64)[:, None]
-        world_from_cam = self.world_from_cam
-        return np.asarray(cam @ world_from_cam[:3, :3].T + world_from_cam[:3, 3])
+        return np.asarray(self.center + np.asarray(depth, np.float64)[:, None] * self.rays(uv))
 
 
 def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:

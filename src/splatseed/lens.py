@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics
+from splatseed.projection import denormalized, normalized
 from splatseed.text import quoted
 
 
@@ -56,8 +57,7 @@ def undistorted_folder(scene: Path) -> Path:
 
 def project_rays(lens: Intrinsics, xy: Float64[np.ndarray, "*B 2"]) -> Float64[np.ndarray, "*B 2"]:
     """Project rays (x, y, 1) to pixels; the centre of the first pixel is (0.5, 0.5)."""
-    K = lens.K
-    return np.asarray(distort(lens, xy) * K[[0, 1], [0, 1]] + K[:2, 2])
+    return denormalized(lens.K, distort(lens, xy))
 
 
 def distort(lens: Intrinsics, xy: Float64[np.ndarray, "*B 2"]) -> Float64[np.ndarray, "*B 2"]:
@@ -89,8 +89,7 @@ def unproject_pixels(
 
     NaN where no ray within the lens's fold projects to the pixel.
     """
-    K = lens.K
-    goal = (np.asarray(uv, np.float64) - K[:2, 2]) / K[[0, 1], [0, 1]]
+    goal = normalized(lens.K, uv)
     xy, moves = goal.copy(), DISTORTION.difference * np.eye(2)
     with np.errstate(all="ignore"):  # distant coordinates need not stay finite
         for _ in range(DISTORTION.newton_steps):

@@ -1,4 +1,4 @@
-"""Report progress, findings and the compilation of kernels to the caller.
+"""Report progress, findings and the compilation of kernels to the caller; work in threads.
 
 A ``Progress`` is any callable that takes a stage's name and the fraction of it that is done, from
 0 to 1. Library functions default to ``silent``; the command line passes a progress bar. A ``Note``
@@ -23,7 +23,7 @@ Note: TypeAlias = Callable[[Finding], None]
 extraction_progress: ContextVar[Progress] = ContextVar("extraction_progress")
 """Called while a video or archive is extracted (``io.extraction``); unset: shown nowhere."""
 thread_limit: ContextVar[int | None] = ContextVar("thread_limit", default=None)
-"""Maximum threads of ``in_threads``; None for one per CPU."""
+"""Maximum threads of ``in_threads``; None for one per available CPU."""
 
 
 COMPILATION = "compiling kernels"
@@ -80,6 +80,19 @@ def blocks(total: int, size: int, stage: str, progress: Progress) -> Iterator[tu
         progress(stage, stop / total)
 
 
+def available_cpus() -> int:
+    """Return how many CPUs this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on Windows and macOS
+        return os.cpu_count() or 1
+
+
+def num_threads() -> int:
+    """Return the number of threads to compute with: ``thread_limit``, or one per available CPU."""
+    return thread_limit.get() or available_cpus()
+
+
 def in_threads(
     work: Callable[[int, int], None], total: int, size: int, stage: str, progress: Progress
 ) -> None:
@@ -90,7 +103,7 @@ def in_threads(
     """
     progress(stage, 0.0)
     starts = range(0, total, size)
-    pool = ThreadPoolExecutor(thread_limit.get() or os.cpu_count())
+    pool = ThreadPoolExecutor(num_threads())
     try:
         pieces = pool.map(lambda start: work(start, min(start + size, total)), starts)
         for done, _ in enumerate(pieces, start=1):

@@ -389,8 +389,8 @@ class Scene:
         """Mark the tracked points that another cloud has first and in order, else none."""
         kept = np.zeros(len(self.tracks or ()), bool)
         rows = points.rows_of_originals
-        rising = np.append(np.diff(rows, prepend=-1) <= 0, True)
-        num = min(int(rising.argmax()), int(np.append(rows >= len(kept), True).argmax()))
+        in_order = (np.diff(rows, prepend=-1) > 0) & (rows < len(kept))
+        num = len(rows) if in_order.all() else int(in_order.argmin())  # up to the first that is not
         kept[rows[:num]] = True
         others = rows[num:][(rows[num:] >= 0) & (rows[num:] < len(kept))]
         # A row of another scene's cloud may have the same number, but seldom the same position.

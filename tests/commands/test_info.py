@@ -16,7 +16,7 @@ from PIL import Image as PilImage
 from splatseed import upsample
 from splatseed.commands import next_steps
 from splatseed.commands.next_steps import number_option
-from splatseed.depth.alignment import align
+from splatseed.depth.alignment import align_maps
 from splatseed.depth.settings import PER_POINT
 from splatseed.io import find_depths, load_scene, write_scene
 from splatseed.io.colmap import write_points3d
@@ -176,7 +176,7 @@ def test_true_depth_fits(room, splatseed):
     assert pairs["maps"] == "12 of 12 images, the first 96 x 72, kind z"
     assert pairs["left out"] == "0"
     scene = load_scene(room)
-    expected = align(scene.replace(depths=find_depths(scene, room / "depths")))
+    expected = align_maps(scene.replace(depths=find_depths(scene, room / "depths")))
     assert rows.keys() == expected.keys()
     for name, (points, scale, _, residual) in rows.items():
         assert int(points.replace(",", "")) == expected[name].num_points

@@ -21,6 +21,7 @@ from PIL import Image as PilImage
 import splatseed as ss
 from splatseed.camera import rotation_from_quat
 from splatseed.commands.upsample.cloud import LoadedCloud
+from splatseed.findings import Finding
 from splatseed.io import load_scene, write_scene
 from splatseed.io.nerfstudio import read_cloud_transform
 from splatseed.io.origin import translated
@@ -490,7 +491,7 @@ def test_the_files_of_an_alignment_are_listed(splatseed, room, scan, tmp_path, m
         sample=None,
         rgb=None,
         tie_points=None,
-        summary="",
+        finding=Finding("cloud-alignment", "", "info"),
     )
     monkeypatch.setattr(
         "splatseed.commands.upsample.command.load_cloud",

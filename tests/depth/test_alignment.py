@@ -9,8 +9,8 @@ import pytest
 
 from splatseed.depth.alignment import (
     PlanarDepth,
-    align,
     align_map,
+    align_maps,
     least_squares_line,
     least_squares_scale,
     median_scale,
@@ -83,7 +83,7 @@ def test_alignment_recovers_the_scale_of_each_image(kind, tracked, exact, make_m
     scene = with_outliers(exact.replace(depths=maps))
     if not tracked:
         scene = scene.replace(tracks=None)
-    alignments = align(scene, max_residual_ratio=None)
+    alignments = align_maps(scene, max_residual_ratio=None)
     assert list(alignments) == [image.name for image in exact.images]
     for image, found, scale in zip(exact.images, alignments.values(), SCALES, strict=True):
         assert found.rejected is None
@@ -132,20 +132,20 @@ def test_rejected_images_have_a_reason(exact, make_maps):
         return z * noise.uniform(0.9, 1.1, z.shape) if i == 3 else z
 
     scene = exact.replace(depths=make_maps("z", change))
-    reasons = [alignment.rejected for alignment in align(scene).values()]
+    reasons = [alignment.rejected for alignment in align_maps(scene).values()]
     assert None not in reasons[:5]
     assert len(set(reasons[:5])) == 5  # a reason of its own for each
     assert "20" in reasons[1]  # the points that are needed
     assert all(re.search(r"\d%", reason) for reason in reasons[2:4])  # by how much
     assert set(reasons[5:]) == {None}
-    assert list(align(scene, max_residual_ratio=None).values())[3].rejected is None
+    assert list(align_maps(scene, max_residual_ratio=None).values())[3].rejected is None
 
 
 def test_depth_read_as_inverse_depth_is_rejected(exact, make_maps):
-    alignments = align(exact.replace(depths=make_maps("inverse", lambda z, _: z)))
+    alignments = align_maps(exact.replace(depths=make_maps("inverse", lambda z, _: z)))
     assert all(alignment.rejected for alignment in alignments.values())
-    alignments = align(exact.replace(depths=make_maps("z", lambda z, _: 1 / z))).values()
-    good = align(exact).values()
+    alignments = align_maps(exact.replace(depths=make_maps("z", lambda z, _: 1 / z))).values()
+    good = align_maps(exact).values()
     assert np.median([a.residual for a in alignments]) > 10 * np.median([a.residual for a in good])
 
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 import splatseed as ss
 from splatseed.methods.patches import local_frames
-from splatseed.seeding.geometry_score import far_share, spacing
+from splatseed.seeding.geometry_score import far_share, mean_spacing
 from splatseed.synthetic import SHAPES
 from splatseed.synthetic.surfaces import parallel_plates, plane
 
@@ -35,7 +35,7 @@ def scanned(shape, noise=NOISE):
     """Noisy samples of a surface, and their mean spacing."""
     rng = np.random.default_rng(3)
     xyz = SHAPES[shape]().sample(NUM, rng)
-    h = spacing(xyz)
+    h = mean_spacing(xyz)
     xyz += noise * h * rng.normal(size=xyz.shape)
     return ss.PointCloud(xyz.astype(np.float32), np.full((NUM, 3), 128, np.uint8)), h
 

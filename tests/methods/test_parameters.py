@@ -15,6 +15,7 @@ from splatseed.errors import (
     PointCloudError,
     UnknownNameError,
 )
+from splatseed.findings import Finding
 from splatseed.methods import configure
 from splatseed.pointcloud import PointCloud
 
@@ -138,6 +139,20 @@ def test_what_a_method_knows_of_its_points_is_handed_on(wavy):
     assert np.isnan(seeds.sizes[: len(wavy)]).all()
     assert seeds.normals is None
     assert ss.upsample(wavy, Copies(), num_points=len(wavy) + 4).attributes == {}
+
+
+class Reporting(Copies):
+    """A third party's method that reports what it was called with."""
+
+    def __call__(self, scene, num_new, rng, progress, *, note, budget):
+        note(Finding("copies", f"{num_new} of {budget}"))
+        return super().__call__(scene, num_new, rng, progress)
+
+
+def test_a_method_may_report_findings_and_know_the_budget(wavy):
+    notes, num = [], len(wavy) + 4
+    ss.upsample(wavy, Reporting(), num_points=num, budget=num + 1, note=notes.append)
+    assert notes == [Finding("copies", f"4 of {num + 1}")]
 
 
 @pytest.mark.parametrize(

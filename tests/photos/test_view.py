@@ -14,8 +14,7 @@ from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundErro
 from splatseed.io import load_scene, write_scene
 from splatseed.io.photograph_checks import ROUNDING, _off, fits
 from splatseed.lens import project_rays
-from splatseed.photos.cache import load_photograph
-from splatseed.photos.loading import load_split, load_views
+from splatseed.photos.loading import load_photograph, load_split, load_views
 from splatseed.photos.sizes import at_file_size
 from splatseed.photos.undistortion import undistort
 from splatseed.photos.view import camera_views

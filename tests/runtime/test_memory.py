@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import pytest
 
@@ -17,6 +15,7 @@ from splatseed.methods.add_points import BYTES_EACH
 from splatseed.methods.neighbors import NEIGHBOR_BYTES
 from splatseed.photos.loading import load_views
 from splatseed.pointcloud import PointCloud
+from splatseed.progress import num_threads
 from splatseed.runtime import memory
 from splatseed.scene import Scene
 from splatseed.synthetic import make_capture, write_capture
@@ -50,7 +49,7 @@ def test_upsample_says_how_many_points_and_neighbors_fit(free, rng):
 
 
 def test_photographs_of_a_scene_and_what_stereo_holds_beside_them(free, scene):
-    pixels, threads = 4 * 60 * 40, min(os.cpu_count() or 1, 4)
+    pixels, threads = 4 * 60 * 40, min(num_threads(), 4)
     free(3 * pixels)
     views = load_views(scene, scene.images)
     free(3 * pixels - 1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatseed.errors import PointCloudError
-from splatseed.seeding.geometry_score import far_share, measure, spacing
+from splatseed.seeding.geometry_score import far_share, mean_spacing, measure
 from splatseed.synthetic import SHAPES
 
 
@@ -20,24 +20,24 @@ def _brute_spacing(xyz):
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e6])
 def test_spacing_is_the_mean_over_six_neighbours_in_any_unit(scale, rng):
     xyz = rng.normal(size=(300, 3))
-    assert spacing(scale * xyz) == pytest.approx(scale * _brute_spacing(xyz).mean())
+    assert mean_spacing(scale * xyz) == pytest.approx(scale * _brute_spacing(xyz).mean())
     twice = np.array([[0.0, 0, 0], [scale, 0, 0], [0, 0, 0], [scale, 0, 0], [np.nan, 0, 0]])
-    assert spacing(twice) == scale
+    assert mean_spacing(twice) == scale
     often = scale * np.repeat(xyz, 8, axis=0)
-    assert spacing(often) == pytest.approx(spacing(scale * xyz))
+    assert mean_spacing(often) == pytest.approx(mean_spacing(scale * xyz))
 
 
 def test_points_near_a_plane_and_beyond_a_sphere_are_measured(rng):
     plane, sphere = SHAPES["plane"](), SHAPES["sphere"]()
     originals = plane.sample(2000, rng)
-    h = spacing(originals)
+    h = mean_spacing(originals)
     new = plane.sample(1000, rng) + 0.5 * h * plane.frame[2]
     full = np.concatenate([originals, new])
     score = measure(new, full, plane, plane.sample(4000, rng), h)
     assert (score.error, score.p95) == (pytest.approx(0.5), pytest.approx(0.5))
     assert score.share_far == 0
     originals, extra = sphere.sample(500, rng), sphere.sample(1500, rng)
-    samples, h = sphere.sample(5000, rng), spacing(originals)
+    samples, h = sphere.sample(5000, rng), mean_spacing(originals)
     before = measure(originals, originals, sphere, samples, h)
     after = measure(extra, np.concatenate([originals, extra]), sphere, samples, h)
     assert after.coverage < 0.6 * before.coverage
@@ -69,6 +69,6 @@ def test_far_share_of_tiny_clouds():
 def test_clouds_without_spacing_are_refused():
     for xyz in (np.empty((0, 3)), np.ones((1, 3)), np.ones((9, 3))):
         with pytest.raises(PointCloudError):
-            spacing(xyz)
+            mean_spacing(xyz)
     with pytest.raises(PointCloudError):
         far_share(np.full((2, 3), np.nan), np.zeros((1, 3)))

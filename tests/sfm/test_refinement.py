@@ -23,7 +23,7 @@ from splatseed.sfm.pipeline import _Refined, refined as refined_scene, with_refi
 from splatseed.sfm.refinement import (
     Poses,
     Refinement,
-    align,
+    align_poses,
     poses_of,
     refine,
     shifts,
@@ -69,7 +69,7 @@ def test_noise_is_taken_out_the_same_each_time(room, refined):
     before, found = median_errors(poses_of(given), true), poses_of(images)
     # In the given frame, whose own error is the noise's mean over 12 cameras
     assert (median_errors(found, true) < before / 2).all()
-    assert (median_errors(align(found, true), true) < before / 15).all()
+    assert (median_errors(align_poses(found, true), true) < before / 15).all()
     assert spread(found) == pytest.approx(spread(true), rel=0.02)  # metres stay metres
     assert not refinement.kept
     assert refinement.error_after < 0.25
@@ -96,7 +96,7 @@ def test_pairs_by_poses_that_are_off_suffice(room, tmp_path, monkeypatch):
     assert len(shared) > 50
     true, (images, _) = poses_of(room.images), refine(run, given)
     before, found = median_errors(poses_of(given), true), poses_of(images)
-    assert (median_errors(align(found, true), true) < before / 15).all()
+    assert (median_errors(align_poses(found, true), true) < before / 15).all()
 
 
 def test_true_poses_stay_exactly(room, refined):
@@ -142,7 +142,7 @@ def test_a_scene_has_the_refined_poses_and_one_without_matches_its_own(room, tmp
     assert report.refinement.median_shift == pytest.approx(np.median(moved))
     true = poses_of(room.images[1:])
     before = median_errors(poses_of(given.images[1:]), true)
-    assert (median_errors(align(poses_of(found[1:]), true), true) < before / 20).all()
+    assert (median_errors(align_poses(poses_of(found[1:]), true), true) < before / 20).all()
     assert report.mean_reprojection_error < 0.25
     stages = ["features", "matching", "refinement", "triangulation", "undistortion"]
     assert list(report.seconds) == stages
@@ -158,7 +158,7 @@ def test_rotations_count_and_a_wrong_camera_hardly(wrong):
     turn = Rotation.random(1, rng).as_matrix()[0]
     moved = Poses(given.rotations @ turn.T, 2.5 * centers @ turn.T + [3.0, -1.0, 8.0])
     moved.centers[4] += [12.0 * wrong, 0.0, 0.0]
-    aligned, rest = align(moved, given), np.arange(9) != 4
+    aligned, rest = align_poses(moved, given), np.arange(9) != 4
     assert turns(aligned, given).max() < (1e-2 if wrong else 1e-4)
     assert shifts(aligned, given)[rest].max() < (1e-3 if wrong else 1e-5)
 

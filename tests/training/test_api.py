@@ -79,6 +79,8 @@ def test_wrong_arguments_are_named(trained, tmp_path):
         with pytest.raises(ParameterError, match=named):
             ss.train(scene, tmp_path / "run", **wrong)
         assert not (tmp_path / "run").exists()
+    with pytest.raises(ParameterError, match="test_every"):
+        ss.evaluate(run, scene, test_evry=3)
     with pytest.raises(OutputError, match="overwrite"):
         ss.train(scene, run.folder, **SHORT)
     with pytest.raises(SceneNotFoundError):

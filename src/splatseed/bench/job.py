@@ -39,11 +39,11 @@ from splatseed.errors import (
 from splatseed.io.files import ARCHIVE_FAILURES
 from splatseed.io.staging import MANIFEST, atomic_file, output_folder, write_json
 from splatseed.methods import Upsampler, chooses_number, configure
-from splatseed.photos.cache import user_cache_dir
+from splatseed.photos.loading import user_cache_dir
 from splatseed.pointcloud import PointCloud
-from splatseed.progress import Progress, StageTimes, silent, watched
+from splatseed.progress import Progress, StageTimes, available_cpus, silent, watched
 from splatseed.requirements import version_of
-from splatseed.runtime.environment import available_cpus, worker_env
+from splatseed.runtime.environment import worker_env
 from splatseed.runtime.memory import peak_bytes
 from splatseed.runtime.tasks import ProcessWorkers, Report, Workers, run_tasks
 from splatseed.scene import Scene

@@ -201,7 +201,7 @@ def _has_pytorch() -> bool:
 def _make_points(options: Options) -> None:
     """Write the capture, its points by every method, their errors, and pictures."""
     from splatseed.photos.viewpoint import choose_camera
-    from splatseed.seeding.geometry_score import measure, spacing
+    from splatseed.seeding.geometry_score import mean_spacing, measure
     from splatseed.synthetic import make_capture, write_capture
     from splatseed.viewer import clouds as pictures
 
@@ -241,7 +241,7 @@ def _make_points(options: Options) -> None:
         clouds = {name: clouds[name] for name in methods}
         clock("measure", 0.0)
         xyz, surfaces = scene.points.xyz, capture.surfaces
-        h, samples = spacing(xyz), capture.sample_visible(SAMPLES, np.random.default_rng(0))
+        h, samples = mean_spacing(xyz), capture.sample_visible(SAMPLES, np.random.default_rng(0))
         new = {name: cloud.select(slice(len(xyz), None)) for name, cloud in clouds.items()}
         scores = {"originals": measure(xyz, xyz, surfaces, samples, h)}
         for name, cloud in clouds.items():

@@ -6,12 +6,11 @@ With ``--json``, stdout is one JSON object: lengths are in scene units, five num
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -51,6 +50,7 @@ from splatseed.training.schedule import FULL_RUN
 
 if TYPE_CHECKING:  # Numba, which takes a while to load, comes with it
     from splatseed.depth.alignment import Alignment
+    from splatseed.seeding.pose_accuracy import PoseErrorEstimate
 
 KINDS_SHOWN = 3
 """Kinds of cameras listed; collections of photographs from the web have one per photograph."""
@@ -107,18 +107,17 @@ def run(arguments: list[str]) -> None:
         known = _known_depths(scene.depths, clock) if options.depth and scene.depths else 0
         maps = diagnostics.depth_map_statistics(scene, clock)
         beside = len(depths_beside(scene) or ())
-        poses, faint = _check_poses(scene, masks.share, clock)
+        poses = _check_poses(scene, masks.share, clock)
         mismatch = _unit_mismatch(scene, poses)
     if maps is not None and mismatch:
-        maps = dataclasses.replace(maps, in_scene_units=False)
-    doubt = poses["problem"] if poses else ""
-    problems += [*stray_cameras(scene), *([masks.problem] if masks.problem else [])]
-    problems += _unfit_maps(scene, alignments or {})
-    problems += [each for each in (doubt, faint, mismatch) if each]
+        maps = replace(maps, in_scene_units=False)
+    problems += [*stray_cameras(scene), *masks.findings, *_unfit_maps(scene, alignments or {})]
+    problems += [*(poses.findings if poses else ()), *mismatch]
     if options.json:
         facts = {
             "points": cloud, "tracks": tracks, "empty": regions, "poses": poses, "masks": masks,
-            "depth_map_statistics": maps, "depth": alignments, "problems": problems,
+            "depth_map_statistics": maps, "depth": alignments,
+            "problems": [with_options(str(each)) for each in problems], "findings": problems,
         }  # fmt: skip
         facts = _plain({**_facts_of(scene), **facts})
         print(json.dumps(facts, indent=2, allow_nan=False), file=OUT.file)
@@ -139,13 +138,13 @@ def run(arguments: list[str]) -> None:
     print_pairs(str(options.scene), rows)
     if alignments is not None:
         _print_depth(str(options.depth), scene, alignments)
-    _print_list("problems" if problems else "no problems found", problems)
+    _print_list("problems" if problems else "no problems found", [*map(str, problems)])
     if options.picture is not None:
         print_pairs("picture", [("of depth", str(options.picture))])
     if len(scene.points) or scene.images:
         if missing := untrainable(scene):
             print_note(missing)
-        print_pairs("next", _next(options, usable, advice, planned, known, doubt))
+        print_pairs("next", _next(options, usable, advice, planned, known, poses))
 
 
 def _shows_model(options: Options) -> bool:
@@ -189,9 +188,9 @@ def _read(options: Options) -> Scene:
 
 def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, Alignment]:
     """Align each map with the SfM points; draw the picture, if requested."""
-    from splatseed.depth.alignment import align
+    from splatseed.depth.alignment import align_maps
 
-    alignments = align(scene, progress=clock)
+    alignments = align_maps(scene, progress=clock)
     if options.picture is not None:
         from splatseed.viewer.maps import preview_depth
 
@@ -210,66 +209,97 @@ def _known_depths(depths: DepthMaps, clock: StageClock) -> int:
     return known
 
 
-def _unfit_maps(scene: Scene, alignments: Mapping[str, Alignment]) -> list[str]:
-    """Describe maps that cannot be aligned, as a list of at most one problem."""
+def _unfit_maps(scene: Scene, alignments: Mapping[str, Alignment]) -> list[Finding]:
+    """Report maps that cannot be aligned."""
     if alignments and not len(scene.points) and not in_scene_units(scene.depths):
         unit = "only maps in the scene's unit can be used, with --depth.no-align"
-        return [f"there are no points to align the depth maps with: {unit}"]
-    unfit = sum(each.rejected is not None for each in alignments.values())
-    maps = f"{unfit:,} of {len(alignments):,} depth maps"
-    return [f"{maps} cannot be aligned with the points, and are left out"] if unfit else []
+        text = f"there are no points to align the depth maps with: {unit}"
+        return [Finding("no-points-to-align", text)]
+    unfit = tuple(name for name, each in alignments.items() if each.rejected is not None)
+    maps = f"{len(unfit):,} of {len(alignments):,} depth maps"
+    text = f"{maps} cannot be aligned with the points, and are left out"
+    return [Finding("unfit-depth-maps", text, subjects=unfit)] if unfit else []
 
 
-def _check_poses(
-    scene: Scene, masked: float, progress: Progress
-) -> tuple[dict[str, Any] | None, str]:
-    """Compare a few photographs of a scene.
+@dataclass(frozen=True)
+class _PoseCheck:
+    """What comparing a few photographs shows about the poses."""
 
-    ``masked`` is the share of pixels that masks exclude. Returns None without photographs; else the
-    share of checked pixels whose depth other photographs confirm (``agreement``), the pose error
-    (``error``) and the resulting ``problem``. The second value is a warning if photographs agree at
-    few pixels, else empty. A scene with points has neither: it can be trained from them.
+    agreement: float  # fraction of the compared pixels whose depth other photographs confirm
+    error: PoseErrorEstimate | None
+    doubts: tuple[Finding, ...] = ()  # why the poses may be wrong
+    faint: tuple[Finding, ...] = ()  # that photographs agree at few pixels
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        return (*self.doubts, *self.faint)
+
+    @property
+    def inexact(self) -> bool:
+        """Whether refinement may correct the poses."""
+        from splatseed.seeding.pose_accuracy import INEXACT_POSES
+
+        return any(each.kind == INEXACT_POSES for each in self.doubts)
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What ``--json`` prints."""
+        problem = with_options("".join(map(str, self.doubts)))
+        return {"agreement": self.agreement, "error": self.error, "problem": problem}
+
+
+def _check_poses(scene: Scene, masked: float, progress: Progress) -> _PoseCheck | None:
+    """Compare a few photographs of a scene; None without photographs.
+
+    ``masked`` is the share of pixels that masks exclude. A scene with points has no doubts: it can
+    be trained from them.
     """
     if not scene.has_photographs:
-        return None, ""
-    from splatseed.seeding.pose_accuracy import estimate_pose_error, given_pose_error
-    from splatseed.seeding.poses import agreement_findings, check_poses
+        return None
+    from splatseed.seeding.pose_accuracy import INEXACT_POSES, estimate_pose_error, given_pose_error
+    from splatseed.seeding.poses import InexactPosesError, agreement_findings, check_poses
 
     try:
         images = photographed(scene)
         agreement = check_poses(scene, images, progress)
     except SplatseedError as refused:
         if has_points(scene):
-            return None, ""
-        problem = with_options(f"The photographs cannot be compared: {refused}")
-        return {"agreement": 0.0, "error": None, "problem": problem}, ""
+            return None
+        kind = INEXACT_POSES if isinstance(refused, InexactPosesError) else "photographs-disagree"
+        text = f"The photographs cannot be compared: {refused}"
+        return _PoseCheck(0.0, None, (Finding(kind, text, "error"),))
     if has_points(scene):
-        error = estimate_pose_error(scene, images, progress)
-        return {"agreement": agreement, "error": error, "problem": ""}, ""
+        return _PoseCheck(agreement, estimate_pose_error(scene, images, progress))
     error = given_pose_error(scene, images, progress)
-    problem = with_options("".join(map(str, error.findings))) if error else ""
-    facts = {"agreement": agreement, "error": error, "problem": problem}
-    return facts, "".join(map(str, agreement_findings(agreement, masked)))
+    doubts = error.findings if error else ()
+    return _PoseCheck(agreement, error, doubts, agreement_findings(agreement, masked))
 
 
-def _unit_mismatch(scene: Scene, poses: Mapping[str, Any] | None) -> str:
-    """Describe depth maps of another unit than the poses, unless the poses cannot be checked."""
-    if not in_scene_units(scene.depths) or poses is None or not poses["agreement"]:
-        return ""
-    from splatseed.seeding.map_seeds import unit_ratio
+def _unit_mismatch(scene: Scene, poses: _PoseCheck | None) -> tuple[Finding, ...]:
+    """Report depth maps of another unit than the poses, unless the poses cannot be checked."""
+    if not in_scene_units(scene.depths) or poses is None or not poses.agreement:
+        return ()
+    from splatseed.seeding.map_seeds import UNIT_MISMATCH, unit_ratio
 
     ratio = unit_ratio(scene, photographed(scene))
     if ratio is None:
-        return ""
+        return ()
     times = f"their depth is {ratio:.4g} times that of the photographs"
-    return f"the depth maps are in another unit than the poses: {times}"
+    text = f"the depth maps are in another unit than the poses: {times}"
+    return (Finding(UNIT_MISMATCH, text, "error"),)
 
 
 def _next(
-    options: Options, scene: Scene, advice: Advice, planned: Planned, known: int, problem: str
+    options: Options,
+    scene: Scene,
+    advice: Advice,
+    planned: Planned,
+    known: int,
+    poses: _PoseCheck | None,
 ) -> Commands:
     """Return the next commands, or the choices if there are several."""
-    any_points, refine = len(scene.points) > 0, "--refine-poses" in problem
+    any_points, refine = len(scene.points) > 0, poses is not None and poses.inexact
+    sound = poses is None or not poses.doubts
     lifted = ""
     metric = in_scene_units(scene.depths) and not any_points
     if metric and not is_distorted(scene) and scene.has_photographs:
@@ -283,7 +313,7 @@ def _next(
     if any_points and lifted:
         return [("", lifted)]
     advised: Commands = []
-    if any_points or (scene.has_photographs and (refine or not problem)):
+    if any_points or (scene.has_photographs and (refine or sound)):
         advised = next_steps.advice_commands(options.scene, scene, advice, planned, refine=refine)
     if any_points:
         return advised
@@ -314,10 +344,10 @@ def _facts_of(scene: Scene) -> dict[str, Any]:
 
 def _plain(value: Any) -> Any:
     """Convert a value for JSON: a dataclass to an object, a number that is not finite to null."""
-    if isinstance(value, Finding):
-        return str(value)
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        value = dataclasses.asdict(value)
+    if isinstance(value, _PoseCheck):
+        value = value.facts
+    if is_dataclass(value) and not isinstance(value, type):
+        value = asdict(value)
     if isinstance(value, Mapping):
         return {str(key): _plain(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
@@ -398,7 +428,7 @@ def _track_rows(tracks: diagnostics.TrackStatistics | None) -> list[tuple[str, s
 
 def _photograph_rows(
     regions: diagnostics.EmptyRegions | None,
-    poses: Mapping[str, Any] | None,
+    poses: _PoseCheck | None,
     masks: diagnostics.MaskStatistics,
 ) -> list[tuple[str, str]]:
     rows = []
@@ -409,12 +439,12 @@ def _photograph_rows(
         worst = f"{regions.worst:.0%} in {regions.worst_name}"
         grid = f"(of cells, {diagnostics.EMPTY_CELLS} along the longer side)"
         rows.append(("image area without points", f"{regions.mean:.0%} on average, {worst} {grid}"))
-    if poses and (poses["error"] is not None or not poses["problem"]):
+    if poses and (poses.error is not None or not poses.doubts):
         from splatseed.seeding.poses import agreement_findings
 
-        few = bool(agreement_findings(poses["agreement"]))
-        agreed = f"at {poses['agreement']:.0%} of the pixels compared: {'few' if few else 'enough'}"
-        error = poses["error"]
+        few = bool(agreement_findings(poses.agreement))
+        agreed = f"at {poses.agreement:.0%} of the pixels compared: {'few' if few else 'enough'}"
+        error = poses.error
         miss = "unknown: too few corners are found again" if error is None else error.verdict
         rows += [("photographs agree", agreed), ("pose error", miss)]
     return rows

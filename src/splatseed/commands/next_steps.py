@@ -17,7 +17,7 @@ from splatseed.io.staging import read_manifest
 from splatseed.io.transforms_layout import Layout
 from splatseed.lens import undistort_command, undistorted_folder
 from splatseed.photos.sizes import TRAINED_SIDE, factor_for_size
-from splatseed.runtime.environment import available_cpus
+from splatseed.progress import available_cpus
 from splatseed.scene import Image, Scene
 from splatseed.seeding.advice import AS_IT_IS, SEEDED, Advice, is_distorted, untrainable
 from splatseed.seeding.photo_methods import Auto

@@ -26,6 +26,7 @@ from splatseed.depthmap import DepthMap, in_scene_units
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.photos.visibility import PointsInImage, find_visibility, points_in_image
 from splatseed.progress import Progress, in_threads, silent
+from splatseed.projection import normalized
 from splatseed.scene import Image, Scene
 
 
@@ -207,14 +208,9 @@ def lift_pixels(
     Equation 9: P = c + z v, where v is the ray through the pixel's centre, with unit z in camera
     axes; the text's P = c + s d v / |v| is the same with z = s d / |v|.
     """
-    m = camera.cam_from_world[:3, :3].T @ np.linalg.inv(camera.K)
     row, column = np.divmod(pixel, camera.width)
-    z = factor * z.astype(np.float64)
-    xyz = np.empty((len(pixel), 3), np.float32)
-    for axis in range(3):
-        ray = m[axis, 0] * (column + 0.5) + m[axis, 1] * (row + 0.5) + m[axis, 2]
-        xyz[:, axis] = camera.center[axis] + z * ray
-    return xyz
+    uv = np.stack([column, row], axis=1) + 0.5
+    return camera.unproject(uv, factor * z.astype(np.float64)).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -228,7 +224,7 @@ class Alignment:
     rejected: str | None = None  # reason why the map is not used; None = it is used
 
 
-def align(
+def align_maps(
     scene: Scene, *, max_residual_ratio: float | None = 3.0, progress: Progress = silent
 ) -> dict[str, Alignment]:
     """Align each depth map of a scene to its SfM points, by image name; rejected maps included.
@@ -349,7 +345,7 @@ def _values_at(
 
 def _rays(camera: Camera, uv: Float64[np.ndarray, "M 2"]) -> Float64[np.ndarray, "M 3"]:
     """Rays of unit z through image positions, in camera axes."""
-    return np.column_stack([uv, np.ones(len(uv))]) @ np.linalg.inv(camera.K).T
+    return np.column_stack([normalized(camera.K, uv), np.ones(len(uv))])
 
 
 def _residual(depth: DepthMap, value: Values, z: Values, scale: float, shift: float) -> float:

@@ -164,7 +164,7 @@ def _reduce(
     return Reduced(
         coarse,
         unit,
-        grid_from_map @ camera.K @ camera.cam_from_world[:3],
+        grid_from_map @ camera.pixels_from_world,
         np.asarray(samples.reduce(2)),
         block_from_map[:, None] * [[factor, first]],
     )

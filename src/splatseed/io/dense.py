@@ -32,6 +32,7 @@ from splatseed.io.staging import MANIFEST, output_folder, write_json
 from splatseed.lens import unproject_pixels
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, in_threads, silent
+from splatseed.projection import denormalized, normalized, pixel_centers
 from splatseed.scene import Image, Observations, Scene, Tracks
 
 DenseMap: TypeAlias = Any
@@ -294,9 +295,9 @@ def _toward_plane(
 ) -> Float64[np.ndarray, "H W"]:
     """Return n . r of each pixel's normal and the ray through (column + at, row + at)."""
     height, width = dense.depth.shape
-    rows, columns = np.mgrid[0:height, 0:width] + at
-    rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(K).T
-    return np.asarray(np.einsum("hwc,hwc->hw", dense.normal.astype(np.float64), rays))
+    x, y = np.moveaxis(normalized(K, pixel_centers(height, width) + (at - 0.5)), -1, 0)
+    nx, ny, nz = np.moveaxis(dense.normal.astype(np.float64), -1, 0)
+    return np.asarray(nx * x + ny * y + nz)
 
 
 def _write_stereo(folder: Path, camera: Camera, dense: DenseMap, sources: Sequence[int]) -> None:
@@ -397,7 +398,7 @@ def _photograph_model(
         if seen is not None:
             uv = seen.xy
             if lens.has_distortion:  # features outside of the lens model stay
-                straight = unproject_pixels(lens, uv) * lens.K[[0, 1], [0, 1]] + lens.K[:2, 2]
+                straight = denormalized(lens.K, unproject_pixels(lens, uv))
                 uv = np.where(np.isnan(straight), uv, straight)
             scale = np.array([record.width / lens.width, record.height / lens.height])
             seen = Observations(uv * scale, seen.point_ids)

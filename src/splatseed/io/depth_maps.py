@@ -30,6 +30,7 @@ from splatseed.io.depth_files import KINDS, SUFFIXES, check_stored, read_confide
 from splatseed.io.files import COPY_AGAIN, read_json, translate_errors
 from splatseed.io.staging import MANIFEST, output_folder, write_json
 from splatseed.lens import project_rays
+from splatseed.projection import normalized, pixel_centers
 from splatseed.scene import Scene
 from splatseed.text import agreeing, counted, name_some
 
@@ -68,9 +69,7 @@ class Undistortion:
         """
         camera, lens = self.cameras[name], self.lenses[name]
         height, width = values.shape
-        column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-        fx, fy, cx, cy = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]]
-        uv = project_rays(lens, np.stack([(column - cx) / fx, (row - cy) / fy], axis=-1))
+        uv = project_rays(lens, normalized(camera.K, pixel_centers(camera.height, camera.width)))
         uv *= [width / lens.width, height / lens.height]
         inside = np.all((uv >= 0) & (uv < [width, height]), axis=-1)
         places = np.floor(np.where(inside[..., None], uv, 0)).astype(np.intp)

@@ -28,6 +28,7 @@ from splatseed.io.mask_files import SUFFIXES, find_masks, find_own_masks, masks_
 from splatseed.io.photograph import has_alpha, open_photograph, photograph_bytes
 from splatseed.io.photograph_checks import photograph_size
 from splatseed.runtime.fingerprint import fingerprint
+from splatseed.sampling import strided
 from splatseed.scene import Masks, Scene
 from splatseed.text import counted
 
@@ -126,7 +127,7 @@ def _mostly_masked(masks: Masks, fix: str = f"use `masks={INVERTED!r}`") -> list
     Masks that the user has called inverted are taken as they are.
     """
     files, shares = [*masks.files.values()], list[float]()
-    for path in files[:: -(-len(files) // _SAMPLE) or 1] if not masks.inverted else ():
+    for path in strided(files, _SAMPLE) if not masks.inverted else ():
         with suppress(SplatseedError), translate_errors(path, "a mask"):  # reported when used
             shares.append(1.0 - float(_read_counts(open_photograph(path, read_bytes(path))).mean()))
     if not shares or (share := float(np.mean(shares))) < _MOST:

@@ -25,6 +25,8 @@ from jaxtyping import Bool, Float, Float32, Float64
 from splatseed.findings import Finding
 from splatseed.photos.view import View, camera_views
 from splatseed.photos.visibility import points_in_image
+from splatseed.projection import camera_centers
+from splatseed.sampling import strided
 from splatseed.scene import Scene
 
 
@@ -60,11 +62,11 @@ class CameraCheck:
 
 def check_cameras(views: Sequence[View], xyz: Float[np.ndarray, "P 3"]) -> CameraCheck:
     """Find stray cameras and the near depth of views of finite points, all in one frame."""
-    centers = camera_centers(views)
+    centers = camera_centers([view.cam_from_world for view in views])
     if not views or not len(xyz):
         return CameraCheck(_distant_cameras(centers), None)
     limit = max(CAMERA_CHECK.min_sample, CAMERA_CHECK.max_projections // len(views))
-    sample = np.asfortranarray(xyz[:: -(-len(xyz) // limit)], np.float64)
+    sample = np.asfortranarray(strided(xyz, limit), np.float64)
     count, area, near, middle = np.array([_point_statistics(view, sample) for view in views]).T
     median_count = np.median(count)
     min_count = max(
@@ -117,14 +119,6 @@ def stray_findings(names: Sequence[str]) -> tuple[Finding, ...]:
         text = f"{len(names):,} cameras are far from all others: check their poses, or leave them"
         text = f"{text} out ({listed})."
     return (Finding("stray-cameras", text, subjects=tuple(names)),)
-
-
-def camera_centers(views: Sequence[View]) -> Float64[np.ndarray, "V 3"]:
-    """Return the camera positions in the world."""
-    poses = np.array([view.cam_from_world for view in views]).reshape(-1, 4, 4)
-    # Written-out sums: BLAS's order varies with threads.
-    rotation, shift = poses[:, :3, :3], poses[:, :3, 3]
-    return np.asarray(-(rotation * shift[:, :, None]).sum(axis=1))
 
 
 def _point_statistics(

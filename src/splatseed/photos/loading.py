@@ -1,26 +1,38 @@
-"""Loading of views: photographs, masks and cameras of a scene's images, at the size to use."""
+"""Load views: photographs, masks and cameras of a scene's images, at the size to use.
+
+A smaller copy of a photograph is the mean over blocks of factor x factor pixels, rounded. Copies
+are cached by the content of the original; a failure to write the cache is ignored.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import math
+import zipfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import UInt8
+from platformdirs import user_cache_path
 
 from splatseed.camera import Camera
-from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.photograph import photograph_folder
+from splatseed.errors import OutputError, ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.io.bit_depth import WHITE
+from splatseed.io.files import ARCHIVE_FAILURES, StrPath, read_npy
+from splatseed.io.photograph import decode_photograph, photograph_bytes, photograph_folder
 from splatseed.io.photograph_checks import check_sizes
+from splatseed.io.staging import atomic_file
 from splatseed.lens import undistort_advice
-from splatseed.photos.cache import load_photograph
 from splatseed.photos.sizes import check_side
 from splatseed.photos.view import View
 from splatseed.progress import Progress, silent
 from splatseed.runtime.memory import check_memory
 from splatseed.scene import Image, Scene
 
+FILTER = "box-3"  # part of the cache's key: change it whenever downsampling changes
 READERS = 4  # threads that decode photographs
 
 
@@ -137,3 +149,60 @@ def _load_view(image: Image, data_factor: int, min_side: int, cache_dir: Path | 
         counted = np.repeat(np.where(mask, 255, 0).astype(np.uint8)[..., None], 3, axis=2)
         known &= undistort(counted, lens, K)[0][..., 0] == 255
     return View(image.name, photograph, camera, known)
+
+
+def load_photograph(
+    path: StrPath, factor: int = 1, cache_dir: Path | None = None, white: int = WHITE
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Read a photograph, downsampled by ``factor``.
+
+    Transparent pixels are laid over black, the background of renders. Smaller copies are cached in
+    ``cache_dir``, if there is one.
+    """
+    path = Path(path)
+    if factor < 1:
+        raise ParameterError(
+            "`data_factor` of 1 or more", found=f"{factor}", fix="Images are never enlarged."
+        )
+    encoded = photograph_bytes(path)
+    digest = hashlib.blake2b(encoded, digest_size=16, person=FILTER.encode()).hexdigest()
+    kept = (
+        None if cache_dir is None or factor == 1 else cache_dir / f"{digest}_{factor}_{white}.npz"
+    )
+    if kept is not None and (known := _read(kept)) is not None:
+        return known
+    original = decode_photograph(path, encoded, white)
+    width, height = original.width // factor, original.height // factor
+    check_side(path, 1, factor, (width, height))
+    photograph = original
+    if factor > 1:
+        photograph = original.reduce(factor, (0, 0, width * factor, height * factor))
+    pixels = np.array(photograph)
+    if kept is not None:
+        with suppress(OutputError, OSError):  # a cache that cannot be written is done without
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_file(kept) as partial, partial.open("wb") as file:
+                np.savez(file, photograph=pixels)
+    return pixels
+
+
+def _read(path: Path) -> UInt8[np.ndarray, "H W 3"] | None:
+    """Read a cached copy; None if unusable.
+
+    It is not compressed: reading a PNG takes longer than decoding a JPEG of twice its size.
+    """
+    if not path.is_file():
+        return None
+    # A damaged one is made again. Not by np.load: views are read in threads.
+    with (
+        suppress(*ARCHIVE_FAILURES),
+        zipfile.ZipFile(path) as archive,
+        archive.open("photograph.npy") as file,
+    ):
+        return read_npy(file)
+    return None
+
+
+def user_cache_dir() -> Path:
+    """Return the folder in which downsampled photographs are cached; it may not exist yet."""
+    return user_cache_path("splatseed", appauthor=False) / "images"

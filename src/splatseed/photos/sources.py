@@ -13,6 +13,8 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from splatseed.photos._kernels import add_pair_scores
+from splatseed.projection import camera_centers
+from splatseed.sampling import strided
 
 ANGLES = (1.0, 4.0, 15.0, 45.0)
 """Degrees between a point's rays: the weight rises from 0 to 1 between the first two, and falls to
@@ -37,7 +39,7 @@ def choose_sources(
     scores = np.zeros((count, count))
     if count > 1 and len(xyz):
         order, offsets = views_of_points(seen, len(xyz))
-        sample = [rows[:: -(-len(rows) // MAX_POINTS) or 1] for rows in seen]
+        sample = [strided(rows, MAX_POINTS) for rows in seen]
         starts = np.cumsum([0, *map(len, sample)])
         add_pair_scores(
             np.concatenate(sample), starts, xyz, centers, order, offsets, ANGLES, scores
@@ -55,7 +57,7 @@ def choose_by_pose(
 
     The very nearest are skipped if there are enough others: their parallax is too small.
     """
-    centers = -np.einsum("vji,vj->vi", cam_from_world[:, :3, :3], cam_from_world[:, :3, 3])
+    centers = camera_centers(cam_from_world)
     gap = np.linalg.norm(centers[:, None] - centers, axis=2)
     # The third row of a rotation is the camera's axis in the world.
     cosine = cam_from_world[:, 2, :3] @ cam_from_world[:, 2, :3].T

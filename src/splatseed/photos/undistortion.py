@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float64, UInt8
 from splatseed.camera import Intrinsics
 from splatseed.lens import distort, fold_radius
 from splatseed.photos._kernels import resample
+from splatseed.projection import denormalized, normalized, pixel_centers
 
 BAND = 64  # rows of a photograph computed at a time, which bounds the memory of their rays
 
@@ -25,23 +26,14 @@ def undistort(
     """
     height, width = photograph.shape[:2]
     out, known = np.zeros_like(photograph), np.zeros((height, width), np.bool_)
-    corners = _rays(K, np.array([0.0, width]), np.array([0.0, height]))
+    corners = normalized(K, np.array([(0, 0), (width, 0), (0, height), (width, height)]))
     limit = fold_radius(lens, float(np.linalg.norm(corners, axis=-1).max()))
-    column = np.arange(width) + 0.5
     for first in range(0, height, BAND):
         rows = slice(first, min(first + BAND, height))
-        rays = _rays(K, column, np.arange(rows.start, rows.stop) + 0.5)
+        rays = normalized(K, pixel_centers(rows.stop - first, width) + np.array([0, first]))
         with np.errstate(all="ignore"):  # beyond the fold nothing needs to be finite
-            uv = distort(lens, rays) * K[[0, 1], [0, 1]] + K[:2, 2]
+            uv = denormalized(K, distort(lens, rays))
         # Beyond the fold the lens maps two rays to one pixel.
         uv[np.linalg.norm(rays, axis=-1) > limit] = np.nan
         resample(photograph, uv, out[rows], known[rows])
     return out, known
-
-
-def _rays(
-    K: Float64[np.ndarray, "3 3"], column: Float64[np.ndarray, " W"], row: Float64[np.ndarray, " H"]
-) -> Float64[np.ndarray, "H W 2"]:
-    """(x, y) of the rays (x, y, 1) = K^-1 (column, row, 1) through a grid of pixels."""
-    x, y = np.meshgrid((column - K[0, 2]) / K[0, 0], (row - K[1, 2]) / K[1, 1])
-    return np.stack([x, y], axis=-1)

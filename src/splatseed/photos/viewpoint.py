@@ -12,6 +12,7 @@ from jaxtyping import Float64
 
 from splatseed.camera import Camera
 from splatseed.errors import PointCloudError
+from splatseed.sampling import strided
 from splatseed.scene import Image, Scene
 
 
@@ -98,7 +99,7 @@ def _finite_sample(scene: Scene) -> Float64[np.ndarray, "N 3"]:
             found=f"none among {len(scene.points)}",
             fix="Check that the cloud was read correctly.",
         )
-    return np.asarray(xyz[:: -(-len(xyz) // VIEWPOINT.max_points)])
+    return strided(xyz, VIEWPOINT.max_points)
 
 
 def _synthetic_camera(xyz: Float64[np.ndarray, "N 3"]) -> Camera:

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 
 from splatseed.camera import Camera
-from splatseed.photos.projection import pixels_from_world, project
 from splatseed.pointcloud import ORIGINAL
+from splatseed.projection import project
 from splatseed.scene import Image, Scene
 
 SURFACE = 0.1  # share of a cell's depth up to which a point behind it counts as on its surface
@@ -60,7 +60,7 @@ def points_in_image(
     ``margin`` extends the image on every side by this share of its size. Points with NaN are in no
     image. For many cameras pass ``np.asfortranarray(xyz, np.float64)``.
     """
-    column, row, depth = project(pixels_from_world(camera), xyz)
+    column, row, depth = project(camera.pixels_from_world, xyz)
     low_u, low_v = -margin * camera.width, -margin * camera.height
     inside = (depth > near) & (column >= low_u) & (column < camera.width - low_u)
     inside &= (row >= low_v) & (row < camera.height - low_v)

@@ -1,6 +1,6 @@
 """The surface that a cloud forms in an image, on coarse cells, and the points that it hides.
 
-Notation: an image of W x H pixels is divided into ``grid_shape(camera, c)`` equal cells, of c x c
+Notation: an image of W x H pixels is divided into ``camera.grid_shape(c)`` equal cells, of c x c
 pixels or a little less. The *cell depth* is the lower quartile of the depths (planar z) of a cell's
 points; it is infinite without points, and where at least ``MIN_NEARER`` of the eight neighbours
 are nearer by more than ``SURFACE``: a surface hides what shows between its points.
@@ -18,7 +18,6 @@ from jaxtyping import Bool, Float32, Int64
 
 from splatseed.camera import Camera
 from splatseed.photos._kernels import drop_hidden, find_cells, lower_quartiles, sort_by_cell
-from splatseed.photos.projection import cells_from_world, grid_shape
 from splatseed.photos.visibility import SURFACE, PointsInImage, points_in_image
 
 MIN_NEARER = 5  # nearer ones among a cell's eight neighbours, from which on they hide it
@@ -32,7 +31,7 @@ def cell_depths(
     ``xyz`` is C-contiguous.
     """
     cells, depths = _cells(camera, xyz, cell)
-    shape = grid_shape(camera, cell)
+    shape = camera.grid_shape(cell)
     starts, by_cell = sort_by_cell(cells, depths, shape[0] * shape[1])
     quartiles, visible = np.empty(shape, np.float32), np.empty(shape, np.float32)
     lower_quartiles(starts, by_cell, quartiles)
@@ -45,14 +44,14 @@ def cell_counts(
 ) -> Int64[np.ndarray, " C"]:
     """How many points lie in each cell, hidden or not, row by row."""
     cells, _ = _cells(camera, xyz, cell)
-    rows, cols = grid_shape(camera, cell)
+    rows, cols = camera.grid_shape(cell)
     return np.bincount(cells[cells >= 0], minlength=rows * cols)
 
 
 def _cells(camera: Camera, xyz: Float32[np.ndarray, "N 3"], cell: float) -> tuple[np.ndarray, ...]:
     """The cell (row by row; -1 outside) and the depth of each point."""
     cells, depths = np.empty(len(xyz), np.int32), np.empty(len(xyz), np.float32)
-    find_cells(xyz, cells_from_world(camera, cell), *grid_shape(camera, cell), cells, depths)
+    find_cells(xyz, camera.cells_from_world(cell), *camera.grid_shape(cell), cells, depths)
     return cells, depths
 
 

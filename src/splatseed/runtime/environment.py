@@ -1,4 +1,4 @@
-"""Environment variables that libraries read when they load, and the CPUs of this process."""
+"""Environment variables that libraries read when they load."""
 
 from __future__ import annotations
 
@@ -33,11 +33,3 @@ def worker_env(threads: int, gpu: str = "") -> dict[str, str]:
     environment = {f"{library}_NUM_THREADS": str(threads) for library in libraries}
     environment["OMP_WAIT_POLICY"] = os.environ.get("OMP_WAIT_POLICY", "passive")
     return {**environment, "CUDA_VISIBLE_DEVICES": gpu} if gpu else environment
-
-
-def available_cpus() -> int:
-    """Return how many CPUs this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on Windows and macOS
-        return os.cpu_count() or 1

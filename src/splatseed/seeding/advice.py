@@ -163,7 +163,7 @@ def camera_layout(
     """Classify the layout of a scene's cameras; None for fewer than three."""
     if len(scene.images) < 3:
         return None
-    world_from_cam = [np.linalg.inv(image.camera.cam_from_world) for image in scene.images]
+    world_from_cam = [image.camera.world_from_cam for image in scene.images]
     axes = np.array([pose[:3, 2] for pose in world_from_cam])
     centers = np.array([pose[:3, 3] for pose in world_from_cam])
     if np.linalg.norm(axes.mean(axis=0)) >= MIN_MEAN_DIRECTION:

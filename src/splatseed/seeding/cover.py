@@ -25,7 +25,6 @@ from jaxtyping import Bool, Float32, Float64, Int64
 
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.methods import source_code
-from splatseed.photos.projection import cells_from_world, grid_shape
 from splatseed.photos.view import View
 from splatseed.photos.visibility import SURFACE
 from splatseed.photos.zbuffer import cell_depths
@@ -119,7 +118,7 @@ def reference_depths(
     maps = cell_depths_of_views(views, xyz, cell, progress, "find uncovered cells")
     sizes = np.array([depths.size for depths in maps])
     return ReferenceDepths(
-        np.stack([cells_from_world(view.camera, cell) for view in views]),
+        np.stack([view.camera.cells_from_world(cell) for view in views]),
         np.array([depths.shape for depths in maps]),
         np.cumsum(sizes) - sizes,
         np.concatenate([depths.ravel() for depths in maps]),
@@ -128,7 +127,7 @@ def reference_depths(
 
 def world_from_cells(view: View, cell: float) -> Float64[np.ndarray, "3 4"]:
     """Return the matrix from (column depth, row depth, depth, 1), in cells, to the world."""
-    forward = np.vstack([cells_from_world(view.camera, cell), [0.0, 0.0, 0.0, 1.0]])
+    forward = np.vstack([view.camera.cells_from_world(cell), [0.0, 0.0, 0.0, 1.0]])
     return np.asarray(np.linalg.inv(forward)[:3])
 
 
@@ -293,7 +292,7 @@ def make_seeds(
     ``guess`` are the depths and the distances to the nearest covered cells, in cells.
     """
     depths, distances = guess
-    shape = grid_shape(view.camera, cell)
+    shape = view.camera.grid_shape(cell)
     used = np.ones((1, 1), np.bool_) if mask is None else np.asarray(mask, np.bool_)
     rgb, usable = np.empty((len(empty), 3), np.uint8), np.empty(len(empty), np.bool_)
     mean_colors(view.photograph, used, shape, empty, rgb, usable)

@@ -14,7 +14,6 @@ points as thinning does.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -31,7 +30,7 @@ from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.view import View
 from splatseed.photos.visibility import find_visibility, points_in_image
 from splatseed.pointcloud import PointCloud
-from splatseed.progress import Note, Progress, thread_limit
+from splatseed.progress import Note, Progress, num_threads
 from splatseed.runtime.memory import PROCESS, format_bytes, free_memory, resident_bytes
 from splatseed.scene import Image, Scene
 from splatseed.text import format_duration
@@ -200,7 +199,7 @@ def _plan(images: Sequence[Image], factor: int, grid: int, split: int, num: int)
     sizes = [(im.camera.width // factor, im.camera.height // factor) for im in images]
     pixels = [width * height for width, height in sizes]
     depths = [(width // grid) * (height // grid) for width, height in sizes]
-    threads = min(thread_limit.get() or os.cpu_count() or 1, len(images))
+    threads = min(num_threads(), len(images))
     sources = 1 + min(StereoSettings().num_sources, len(images) - 1)
     # Colours and grey; each thread's photographs with 4 bytes per pixel and candidate planes.
     matching = 4 * sum(pixels) + DENSE.depth_bytes * sum(depths)

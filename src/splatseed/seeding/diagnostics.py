@@ -19,6 +19,7 @@ from splatseed.findings import Finding
 from splatseed.methods.neighbors import prepare, sound_bases
 from splatseed.photos.visibility import points_in_image
 from splatseed.progress import Progress, silent
+from splatseed.sampling import strided
 from splatseed.scene import NO_POINT, Image, Scene
 
 EMPTY_CELLS = 32  # cells of the grid of empty regions along an image's longer side
@@ -234,7 +235,7 @@ class MaskStatistics:
 
     images: int  # masked photographs; with alpha channels only, those of the sample
     share: float  # mean fraction of masked pixels in the sample; 0 without masks
-    problem: str  # why a mask of the sample cannot be used; empty if all can
+    findings: tuple[Finding, ...]  # why a mask of the sample cannot be used
 
 
 @dataclass(frozen=True)
@@ -244,36 +245,36 @@ class MaskSample:
     cells: Mapping[str, Float64[np.ndarray, "R C"] | None]
     """By image, the fraction of each cell's pixels that count; None without a mask."""
     shares: tuple[float, ...]  # fraction of masked pixels of each masked photograph
-    problem: str  # why one cannot be used
+    findings: tuple[Finding, ...]  # why one cannot be used
 
 
 def read_mask_sample(scene: Scene, progress: Progress = silent) -> MaskSample:
     """Read the masks of some photographs of a scene."""
     if scene.masks is None:
-        return MaskSample({}, (), "")
+        return MaskSample({}, (), ())
     files = scene.masks.files
     images = [im for im in scene.images if (im.name in files or not files) and im.has_photograph]
-    images = images[:: -(-len(images) // MAX_MASKS_READ) or 1]
+    images = strided(images, MAX_MASKS_READ)
     cells: dict[str, Float64[np.ndarray, "R C"] | None] = {}
-    shares, problem = [], ""
+    shares, findings = list[float](), list[Finding]()
     for i, image in enumerate(images):
         try:
             counts = image.read_mask()
         except SplatseedError as error:
-            problem = problem or str(error)
+            findings.append(Finding("unusable-mask", str(error), "error", (image.name,)))
             continue
         cells[image.name] = None if counts is None else _cell_shares(image, counts)
         if image.name in files or counts is not None:
             shares.append(0.0 if counts is None else 1.0 - float(counts.mean()))
         progress("read masks", (i + 1) / len(images))
-    return MaskSample(cells, tuple(shares), problem)
+    return MaskSample(cells, tuple(shares), tuple(findings[:1]))
 
 
 def mask_statistics(scene: Scene, sample: MaskSample) -> MaskStatistics:
     """Summarise a sample of masks."""
     files = scene.masks.files if scene.masks and sample.cells else {}
     share = float(np.mean(sample.shares)) if sample.shares else 0.0
-    return MaskStatistics(len(files) or len(sample.shares), share, sample.problem)
+    return MaskStatistics(len(files) or len(sample.shares), share, sample.findings)
 
 
 def _cell_shares(image: Image, counts: Bool[np.ndarray, "H W"]) -> Float64[np.ndarray, "R C"]:

@@ -50,13 +50,13 @@ def measure(
         all_xyz: Originals first, the new points last.
         surfaces: An object with ``distance(xyz)``.
         surface_samples: Points spread evenly over the surfaces.
-        h: The unit, usually ``spacing(originals)``.
+        h: The unit, usually ``mean_spacing(originals)``.
     """
     if len(all_xyz) == 0 or not h > 0:
         raise PointCloudError(
             "at least one point and a spacing above zero to measure with",
             found=f"{len(all_xyz)} points and a spacing of {h}",
-            fix="Pass the whole cloud and spacing(originals).",
+            fix="Pass the whole cloud and mean_spacing(originals).",
         )
     errors = surfaces.distance(new_xyz) / h if len(new_xyz) else np.array([np.nan])
     coverage = cKDTree(all_xyz).query(surface_samples)[0].mean() / h
@@ -66,10 +66,10 @@ def measure(
     return GeometryScore(float(errors.mean()), median, p95, float(coverage), share)
 
 
-def spacing(xyz: Float[np.ndarray, "N 3"]) -> float:
+def mean_spacing(xyz: Float[np.ndarray, "N 3"]) -> float:
     """Return h, the mean spacing of the points, in scene units."""
     finite = _distinct(xyz)
-    h = float(_spacing(cKDTree(finite), finite).mean()) if len(finite) else 0.0
+    h = float(_spacings(cKDTree(finite), finite).mean()) if len(finite) else 0.0
     if not h > 0:
         raise PointCloudError(
             "at least two distinct finite points to take a spacing of",
@@ -85,7 +85,7 @@ def _distinct(xyz: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "M 3"]:
     return distinct
 
 
-def _spacing(tree: cKDTree, xyz: Float[np.ndarray, "M 3"]) -> Float64[np.ndarray, " M"]:
+def _spacings(tree: cKDTree, xyz: Float[np.ndarray, "M 3"]) -> Float64[np.ndarray, " M"]:
     """Return the spacing of some of a tree's points; 0 if there are no others."""
     distances, _ = tree.query(xyz, k=NEIGHBORS + 1)
     # The point itself has distance 0, missing neighbours inf.
@@ -114,5 +114,5 @@ def far_share(originals_xyz: Float[np.ndarray, "N 3"], new_xyz: Float[np.ndarray
     # An unbalanced tree is built several times faster, and only few queries follow.
     tree = cKDTree(originals, balanced_tree=False, compact_nodes=False)
     to_original, nearest = tree.query(sample[np.isfinite(sample).all(axis=1)])
-    h = _spacing(tree, originals[nearest])
+    h = _spacings(tree, originals[nearest])
     return float(1.0 - np.count_nonzero(to_original <= FAR_SPACINGS * h) / len(sample))

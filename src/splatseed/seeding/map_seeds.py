@@ -25,11 +25,11 @@ from splatseed.depthmap import MIN_CONFIDENCE, DepthMap, DepthMaps
 from splatseed.findings import Finding
 from splatseed.lens import project_rays
 from splatseed.methods import source_code
-from splatseed.photos.projection import cells_from_world, grid_shape, project
 from splatseed.photos.view import View
 from splatseed.photos.zbuffer import cell_depths
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, in_threads, silent
+from splatseed.projection import denormalized, normalized, pixel_centers, project
 from splatseed.scene import Image, Scene
 from splatseed.seeding.cover import GrowableArray, make_seeds
 from splatseed.seeding.poses import compare_samples
@@ -163,7 +163,7 @@ def _seen_through(
     """Mark points in front of everything that one of some other views shows around them."""
     seen = np.zeros(len(points), np.bool_)
     for j in others:
-        column, row, depth = project(cells_from_world(views[j].camera, cell), points)
+        column, row, depth = project(views[j].camera.cells_from_world(cell), points)
         rows, cols = maps[j].shape
         inside = (depth > 0) & (column >= 0) & (column < cols) & (row >= 0) & (row < rows)
         at = np.flatnonzero(inside)
@@ -200,7 +200,7 @@ def cell_maps(
         min_confidence: Depth of a lower confidence is unknown.
         progress: Called with the stage and the fraction done.
     """
-    found = [np.full(grid_shape(view.camera, cell), np.nan, np.float32) for view in views]
+    found = [np.full(view.camera.grid_shape(cell), np.nan, np.float32) for view in views]
 
     def work(start: int, stop: int) -> None:
         for i in range(start, stop):
@@ -214,12 +214,11 @@ def cell_maps(
 
 def depth_at_cells(view: View, image: Image, depth: DepthMap, cell: float) -> CellMap:
     """Return planar depth at the centres of a view's cells, NaN where unknown or near an edge."""
-    rows, cols = grid_shape(view.camera, cell)
+    rows, cols = view.camera.grid_shape(cell)
     if depth.kind == "inverse":  # up to an unknown scale and shift
         return np.full((rows, cols), np.nan, np.float32)
-    row, column = np.indices((rows, cols)) + 0.5
-    pixels = np.stack([column * (view.width / cols), row * (view.height / rows)], axis=-1)
-    rays = (pixels - view.K[:2, 2]) / view.K[[0, 1], [0, 1]]
+    pixels = pixel_centers(rows, cols) * [view.width / cols, view.height / rows]
+    rays = normalized(view.K, pixels)
     with np.errstate(all="ignore"):  # far outside, a lens model need not be finite
         places = _pixels_of_rays(image, depth, rays)
     inside = ((places >= 0) & (places < [depth.width, depth.height])).all(axis=-1)
@@ -260,8 +259,8 @@ def _pixels_of_rays(
     image: Image, depth: DepthMap, rays: Float64[np.ndarray, "R C 2"]
 ) -> Float64[np.ndarray, "R C 2"]:
     """Project rays (x, y, 1) to the pixels of an image's map, with the image's lens."""
-    K = map_camera(depth, image).K
+    camera = map_camera(depth, image)
     if depth.K is not None:
-        return np.asarray(rays * K[[0, 1], [0, 1]] + K[:2, 2])
+        return denormalized(camera.K, rays)
     lens = image.intrinsics
     return project_rays(lens, rays) * [depth.width / lens.width, depth.height / lens.height]

@@ -23,6 +23,8 @@ from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.sources import choose_by_pose
 from splatseed.photos.view import View
 from splatseed.progress import Progress, silent
+from splatseed.projection import pixel_centers
+from splatseed.sampling import evenly_spaced
 from splatseed.scene import Image, Scene
 from splatseed.seeding._kernels.correlation import correlate_patch, interpolate
 
@@ -109,8 +111,7 @@ def estimate_pose_error(
     poses = np.array([image.camera.cam_from_world for image in images])
     partners = choose_by_pose(poses, _SETTINGS.partners)
     factor = factor_for_size(images, _SETTINGS.side)
-    spread = np.linspace(0, len(images) - 1, _SETTINGS.photographs).round().astype(int)
-    chosen = np.unique(spread).tolist()
+    chosen = evenly_spaced(len(images), _SETTINGS.photographs).tolist()
     errors, pairs = [], 0
     for number, i in enumerate(chosen):
         compared = [images[i], *(images[j] for j in partners[i].tolist() if j >= 0)]
@@ -176,8 +177,8 @@ def _gray(view: View) -> Gray:
 def _rotated(image: Gray, homography: Float64[np.ndarray, "3 3"], view: View, margin: int) -> Gray:
     """Resample a photograph in the view's orientation, with a margin; NaN outside of it."""
     rows, columns = view.height + 2 * margin, view.width + 2 * margin
-    v, u = np.indices((rows, columns)) - margin + 0.5
-    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ homography.T
+    uv = pixel_centers(rows, columns) - margin
+    rays = np.concatenate([uv, np.ones((rows, columns, 1))], axis=-1) @ homography.T
     with np.errstate(divide="ignore", invalid="ignore"):
         x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
     turned: Gray = interpolate(image, *np.where(rays[..., 2] <= 0, -1.0, [x - 0.5, y - 0.5]))

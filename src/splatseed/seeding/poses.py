@@ -25,8 +25,11 @@ from splatseed.findings import Finding
 from splatseed.photos.loading import load_views
 from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.sources import choose_by_pose
+from splatseed.photos.visibility import points_in_image
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
+from splatseed.projection import camera_centers, pixel_centers
+from splatseed.sampling import strided
 from splatseed.scene import Image, Scene
 from splatseed.seeding.pose_accuracy import estimate_pose_error
 from splatseed.text import quoted
@@ -89,6 +92,10 @@ CONVENTIONS = {
 """The convention of each format's poses."""
 
 
+class InexactPosesError(SceneFormatError):
+    """Photographs agree nowhere, and their poses miss by an error that refinement can correct."""
+
+
 def check_poses(scene: Scene, images: Sequence[Image], progress: Progress = silent) -> float:
     """Return the mean agreement of a few photographs, or refuse their poses, within seconds.
 
@@ -145,17 +152,14 @@ def _disagreement(
         )
     error = estimate_pose_error(scene, images)
     inexact = error is not None and not error.exact
-    fix = (
-        "Correct the poses with `refine_poses=True`"
-        if inexact
-        else "Check that poses and names of the images belong together"
-    )
-    return SceneFormatError(
-        expected,
-        found=f"a depth that others confirm at {agreement:.1%} of their pixels"
-        + (f"; they miss each other by about {error}" if inexact else ""),
-        fix=f"{fix}, or estimate new poses: {sfm}.",
-    )
+    found = f"a depth that others confirm at {agreement:.1%} of their pixels"
+    new_poses = f"or estimate new poses: {sfm}."
+    if inexact:
+        found += f"; they miss each other by about {error}"
+        fix = f"Correct the poses with `refine_poses=True`, {new_poses}"
+        return InexactPosesError(expected, found=found, fix=fix)
+    fix = f"Check that poses and names of the images belong together, {new_poses}"
+    return SceneFormatError(expected, found=found, fix=fix)
 
 
 def agreement_findings(
@@ -197,7 +201,7 @@ def _check_centers(poses: Poses) -> None:
             found=f"{len(poses)}",
             fix="Add photographs: depth comes from comparing them. Test views do not count.",
         )
-    centers = np.linalg.inv(poses)[:, :3, 3]
+    centers = camera_centers(poses)
     apart = np.abs(centers - centers[0]).max()
     if apart <= np.finfo(np.float32).eps * np.abs(centers).max():
         raise SceneFormatError(
@@ -247,14 +251,13 @@ def compare_sample(
 
 def _any_overlap(cameras: Sequence[Camera]) -> bool:
     """Whether a point at some depth in front of one camera falls into another's image."""
-    uv = (np.indices((4, 5)).reshape(2, -1).T[:, ::-1] + 0.5) / [5, 4]
-    for first in cameras[:: -(-len(cameras) // _SETTINGS.overlap_samples)]:
+    uv = pixel_centers(4, 5).reshape(-1, 2) / [5, 4]
+    for first in strided(cameras, _SETTINGS.overlap_samples):
         for other in cameras:
             if gap := float(np.linalg.norm(first.center - other.center)):
                 z = gap * np.repeat(np.geomspace(0.1, 1000.0, 12), len(uv))
                 xyz = first.unproject(np.tile(uv * [first.width, first.height], (12, 1)), z)
-                pixels = other.project(xyz)[0]  # NaN behind the camera
-                if ((pixels >= 0) & (pixels < [other.width, other.height])).all(axis=1).any():
+                if len(points_in_image(other, xyz).point_idx):
                     return True
     return False
 

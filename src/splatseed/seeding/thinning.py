@@ -24,7 +24,6 @@ from jaxtyping import Bool, Float, Float32, Int32, Int64
 
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.methods import Upsampler, source_code
-from splatseed.photos.projection import cells_from_world
 from splatseed.photos.view import View
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress
@@ -230,7 +229,7 @@ def _places_in_space(xyz: Float32[np.ndarray, "N 3"]) -> _Places:
 
 def _places_in_views(xyz: Float32[np.ndarray, "N 3"], views: Sequence[View]) -> _Places:
     """Find the views that see each point most closely, and its position in them."""
-    matrices = np.stack([cells_from_world(view.camera, 1) for view in views])
+    matrices = np.stack([view.camera.cells_from_world(1) for view in views])
     focals = np.array([np.sqrt(abs(view.K[0, 0] * view.K[1, 1])) for view in views])
     sizes = np.array([[view.width, view.height] for view in views], np.float64)
     shape = len(xyz), min(CLOSEST, len(views))

@@ -21,6 +21,8 @@ from jaxtyping import Float64
 from splatseed.camera import Camera
 from splatseed.photos.sources import choose_by_pose
 from splatseed.photos.visibility import points_in_image
+from splatseed.projection import denormalized, pixel_centers
+from splatseed.sampling import strided
 from splatseed.sfm.first_look import Agreement, Pair
 
 Points: TypeAlias = Float64[np.ndarray, "M 3"]
@@ -95,14 +97,13 @@ def points_of_matches(
 def _world(
     camera: Camera, rays: Float64[np.ndarray, "M 2"], depth: Float64[np.ndarray, " M"]
 ) -> Points:
-    uv = rays * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
-    return camera.unproject(uv, depth)
+    return camera.unproject(denormalized(camera.K, rays), depth)
 
 
 def overlaps(cameras: Sequence[Camera], seen: Sequence[Points]) -> Float64[np.ndarray, "V V"]:
     """Return the overlap of each two views; 0 on the diagonal."""
     seen = _completed(cameras, seen)
-    thinned = [points[:: -(-len(points) // OVERLAP.points) or 1] for points in seen]
+    thinned = [strided(points, OVERLAP.points) for points in seen]
     count = np.array([len(points) for points in thinned])
     owner = np.repeat(np.arange(len(cameras)), count)
     xyz = np.concatenate(thinned)
@@ -151,7 +152,7 @@ def _completed(cameras: Sequence[Camera], seen: Sequence[Points]) -> list[Points
         if known.any():
             from_here = np.linalg.norm(centers[known] - centers[i], axis=1)
             depths[i] = depths[known][from_here.argmin()]
-        relative = (np.indices((6, 8)).reshape(2, -1).T[:, ::-1] + 0.5) / [8, 6]
+        relative = pixel_centers(6, 8).reshape(-1, 2) / [8, 6]
         uv = relative * [cameras[i].width, cameras[i].height]
         completed[i] = cameras[i].unproject(uv, np.full(len(uv), depths[i]))
     return completed

@@ -122,7 +122,7 @@ def spread(poses: Poses) -> float:
     return float(np.sqrt(np.square(poses.centers - poses.centers.mean(axis=0)).sum(axis=1).mean()))
 
 
-def align(moved: Poses, given: Poses) -> Poses:
+def align_poses(moved: Poses, given: Poses) -> Poses:
     """Align ``moved`` to the world frame of ``given`` by a robust similarity.
 
     Residuals are of rotations and centres (centres along a line do not determine the roll about
@@ -356,7 +356,7 @@ class _Solver:
         found = np.array([matrix[:, :3] for matrix in matrices])
         found_centers = np.array([-matrix[:, :3].T @ matrix[:, 3] for matrix in matrices])
         rotations, centers = self._given.rotations.copy(), self._given.centers.copy()
-        rotations[seeing], centers[seeing] = align(
+        rotations[seeing], centers[seeing] = align_poses(
             Poses(found[seeing], found_centers[seeing]), Poses(rotations[seeing], centers[seeing])
         )
         return Poses(rotations, centers)

@@ -9,7 +9,6 @@ scene.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -24,12 +23,12 @@ from scipy.spatial import cKDTree
 from splatseed.depthmap import DepthMaps
 from splatseed.io.files import ARCHIVE_FAILURES
 from splatseed.io.staging import atomic_file
-from splatseed.photos.projection import grid_shape
 from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.view import View, camera_views
 from splatseed.photos.visibility import SURFACE, points_in_image
 from splatseed.photos.zbuffer import cell_depths
-from splatseed.progress import Progress, silent
+from splatseed.progress import Progress, num_threads, silent
+from splatseed.projection import pixel_centers
 from splatseed.scene import Image, Scene
 
 _STAGE = "find co-visible pixels"
@@ -69,7 +68,7 @@ def find_covisible(
     train, test = (_small_views(part, maps) for part in scene.split(test_every))
     views = [*train, *test]
     by_view: dict[str, Bool[np.ndarray, "rows cols"]] = {}
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(num_threads()) as pool:
         depths = []
         for grid in pool.map(lambda view: _depths(view, xyz, maps), views):
             depths.append(grid)
@@ -113,7 +112,7 @@ def _depths(
     if maps is None:
         depths = cell_depths(view.camera, xyz, _cell(view))
     else:  # a sensor's depth is planar, in the scene's unit
-        values = _resized(maps.read(view.name).values, *grid_shape(view.camera, _cell(view)))
+        values = _resized(maps.read(view.name).values, *view.camera.grid_shape(_cell(view)))
         depths = np.nan_to_num(values, nan=np.inf)
     known = np.isfinite(depths)
     if known.any() and not known.all():
@@ -133,8 +132,7 @@ def _covisible(
     rows, cols = depths.shape
     known = np.isfinite(depths)
     # The cells' centres at their depths, in the world.
-    centers = (np.indices(depths.shape).reshape(2, -1)[::-1] + 0.5).T
-    uv = centers * [view.width / cols, view.height / rows]
+    uv = pixel_centers(rows, cols).reshape(-1, 2) * [view.width / cols, view.height / rows]
     xyz = np.asfortranarray(view.camera.unproject(uv, np.where(known, depths, -1.0).ravel()))
     count = np.zeros(rows * cols, np.int32)
     for other, farthest in seen:

@@ -14,9 +14,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.spatial import cKDTree
 
 from splatseed.errors import PointCloudError
-from splatseed.photos.camera_check import camera_centers
 from splatseed.photos.view import View
 from splatseed.pointcloud import PointCloud
+from splatseed.sampling import evenly_spaced
 from splatseed.splat.gaussians import SH_C0, SH_C1, Gaussians
 
 
@@ -146,11 +146,10 @@ def fit_harmonics(seeds: PointCloud, views: Sequence[View]) -> Float32[np.ndarra
     right = np.zeros((len(xyz), 4, 3))
     right[:, 0] = INITIALIZATION.color_weight * SH_C0 * (seeds.rgb / 255.0 - 0.5)
     limit = max(INITIALIZATION.min_views, INITIALIZATION.max_projections // max(1, len(xyz)))
-    view_idx = np.linspace(0, len(views) - 1, min(limit, len(views))).round().astype(int)
-    for view in [views[i] for i in np.unique(view_idx)]:
+    for view in [views[i] for i in evenly_spaced(len(views), limit)]:
         index, uv, _ = visible_points(view.camera, xyz, INITIALIZATION.occlusion_cell, view.mask)
         column, row = uv.astype(np.int64).T
-        offsets = xyz[index].astype(np.float64) - camera_centers([view])[0]
+        offsets = xyz[index].astype(np.float64) - view.camera.center
         d = offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12)
         ones = np.full(len(d), SH_C0)
         basis = np.stack([ones, -SH_C1 * d[:, 1], SH_C1 * d[:, 2], -SH_C1 * d[:, 0]], axis=1)

@@ -19,9 +19,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
-from splatseed.photos.camera_check import camera_centers, check_cameras
+from splatseed.photos.camera_check import check_cameras
 from splatseed.photos.view import NEAR_PLANE, View
 from splatseed.pointcloud import PointCloud
+from splatseed.projection import camera_centers
 from splatseed.splat.gaussians import VISIBLE_LOGIT, Gaussians
 
 SCENE_SCALE = 1.1
@@ -110,7 +111,8 @@ def training_frame(
 
     ``points`` locate the scene and are finite: ``PointCloud.references``, or means of Gaussians.
     """
-    centers, check = camera_centers(views), check_cameras(views, points)
+    centers = camera_centers([view.cam_from_world for view in views])
+    check = check_cameras(views, points)
     usual = centers[~check.strays]
     origin = usual.mean(axis=0)
     extent = float(np.linalg.norm(usual - origin, axis=1).max())

@@ -10,16 +10,18 @@ means over a grid of rays, for antialiasing.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int64, UInt8
+from jaxtyping import Bool, Float32, UInt8
 
 from splatseed.camera import Camera
 from splatseed.photos.viewpoint import look_at
+from splatseed.photos.visibility import points_in_image
+from splatseed.progress import num_threads
+from splatseed.projection import pixel_centers
 from splatseed.synthetic.surfaces import (
     Box,
     Cylinder,
@@ -175,10 +177,8 @@ def pixel_rays(camera: Camera, dx: float = 0.0, dy: float = 0.0) -> Points:
 
     ``dx`` and ``dy`` offset the rays from pixel centres, px.
     """
-    world_from_pixel = camera.cam_from_world[:3, :3].T @ np.linalg.inv(camera.K)
-    u = (np.arange(camera.width) + (0.5 + dx))[:, None] * world_from_pixel[:, 0]
-    v = (np.arange(camera.height) + (0.5 + dy))[:, None] * world_from_pixel[:, 1]
-    return np.asarray(v[:, None] + u + world_from_pixel[:, 2]).reshape(-1, 3)
+    uv = pixel_centers(camera.height, camera.width) + np.array([dx, dy])
+    return camera.rays(uv).reshape(-1, 3)
 
 
 def render_views(
@@ -186,7 +186,7 @@ def render_views(
 ) -> tuple[UInt8[np.ndarray, "V H W 3"], Float32[np.ndarray, "V H W"]]:
     """Render uint8 sRGB images [V, H, W, 3] and planar z float32 [V, H, W]; 0 = no hit."""
     # Views are independent, so threads do not change the result.
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(num_threads()) as pool:
         views = list(pool.map(lambda camera: render_view(room, camera, supersample), cameras))
     return np.stack([image for image, _ in views]), np.stack([depth for _, depth in views])
 
@@ -230,9 +230,7 @@ def _shade(room: Room, camera: Camera, directions: Points) -> Points:
 
 def visible(surfaces: Surface, camera: Camera, xyz: Points) -> Bool[np.ndarray, " N"]:
     """Whether each surface point is in the image and not occluded, [N]."""
-    uv, depth = camera.project(xyz)
-    inside = (depth > 0) & (uv >= 0).all(axis=1) & (uv < [camera.width, camera.height]).all(axis=1)
-    seen: Int64[np.ndarray, " M"] = np.flatnonzero(inside)
+    seen = points_in_image(camera, xyz).point_idx
     first = surfaces.intersect(camera.center, xyz[seen] - camera.center)
     result = np.zeros(len(xyz), bool)
     result[seen] = first > 1.0 - 1e-6  # t = 1 is the point itself

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from scipy import ndimage
 
 from splatseed.camera import Camera
+from splatseed.projection import in_camera, pixel_jacobians
 from splatseed.synthetic.room import visible
 from splatseed.synthetic.surfaces import Surface
 
@@ -222,19 +223,13 @@ def _triangulate(
 
     Each step solves (sum JᵀJ) dx = sum Jᵀ r, with J the derivative of the pixel by the point.
     """
-    rotations = np.stack([camera.cam_from_world[:3, :3] for camera in cameras])[view_idx]
-    shifts = np.stack([camera.cam_from_world[:3, 3] for camera in cameras])[view_idx]
-    focal = np.stack([np.diag(camera.K)[:2] for camera in cameras])[view_idx]
-    center = np.stack([camera.K[:2, 2] for camera in cameras])[view_idx]
+    poses = np.stack([camera.cam_from_world for camera in cameras])[view_idx]
+    focals = np.stack([np.diag(camera.K)[:2] for camera in cameras])[view_idx]
     starts = np.searchsorted(point_idx, np.arange(len(start)))
     xyz = start
     for _ in range(NEWTON_STEPS):
-        cam = np.einsum("tij,tj->ti", rotations, xyz[point_idx]) + shifts
-        slope = cam[:, :2] / cam[:, 2:]
-        # d (x / z) / dX = (R_x - (x / z) R_z) / z; likewise y
-        by_cam = rotations[:, :2] - slope[:, :, None] * rotations[:, 2:]
-        jacobian = focal[:, :, None] * by_cam / cam[:, 2, None, None]  # [T, 2, 3]
-        residual = uv - (focal * slope + center)
+        jacobian = pixel_jacobians(focals, poses, in_camera(poses, xyz[point_idx]))
+        residual = uv - _project(cameras, xyz, point_idx, view_idx)
         normal = np.add.reduceat(np.einsum("tki,tkj->tij", jacobian, jacobian), starts)
         right = np.add.reduceat(np.einsum("tki,tk->ti", jacobian, residual), starts)
         xyz = xyz + np.linalg.solve(normal, right[:, :, None])[:, :, 0]

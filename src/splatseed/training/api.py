@@ -22,7 +22,7 @@ from splatseed.errors import ParameterError
 from splatseed.io import load_scene
 from splatseed.io.files import StrPath, read_text
 from splatseed.io.masks import with_masks
-from splatseed.photos.cache import user_cache_dir
+from splatseed.photos.loading import user_cache_dir
 from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.view import View, camera_views, view_of
 from splatseed.progress import Note, Progress, silent, silent_note

@@ -23,6 +23,7 @@ from splatseed.findings import Finding
 from splatseed.io.files import ARCHIVE_FAILURES
 from splatseed.io.staging import atomic_file
 from splatseed.progress import Note, Progress, silent, silent_note
+from splatseed.sampling import evenly_spaced
 from splatseed.scene import Image, Scene
 from splatseed.training.settings import TrainSettings
 
@@ -106,8 +107,7 @@ def placing_views(
     pixels = fraction * COSTS[device].pixels
     affordable = pixels * settings.max_steps / (scale * settings.factor) ** 2
     count = min(len(images), max(MIN_VIEWS, int(affordable)))
-    places = np.linspace(0, len(images) - 1, count).round().astype(int)
-    return [images[i] for i in places], size
+    return [images[i] for i in evenly_spaced(len(images), count)], size
 
 
 def known_depths(

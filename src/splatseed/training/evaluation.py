@@ -21,7 +21,7 @@ from splatseed.errors import (
 )
 from splatseed.findings import Finding
 from splatseed.io.files import StrPath, read_text
-from splatseed.photos.cache import user_cache_dir
+from splatseed.photos.loading import user_cache_dir
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.scores import EvalResult

@@ -25,9 +25,8 @@ from splatseed.errors import MissingDependencyError, SceneFormatError
 from splatseed.io import load_scene
 from splatseed.io.masks import with_masks
 from splatseed.io.photograph_checks import with_photographs
-from splatseed.photos.cache import user_cache_dir
 from splatseed.photos.camera_check import reference_points
-from splatseed.photos.loading import load_views
+from splatseed.photos.loading import load_views, user_cache_dir
 from splatseed.photos.sizes import factor_for_size as factor_for
 from splatseed.photos.view import View
 from splatseed.progress import Progress, silent

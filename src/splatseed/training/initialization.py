@@ -13,10 +13,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Float, Float32
 
 from splatseed.photos.view import NEAR_PLANE, View
+from splatseed.photos.visibility import points_in_image
 from splatseed.pointcloud import PointCloud
+from splatseed.sampling import evenly_spaced
 from splatseed.splat.from_seeds import fit_harmonics, initial_gaussians
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.training_frame import TrainingFrame, training_frame
@@ -70,34 +72,13 @@ def min_view_depths(
 ) -> Float32[np.ndarray, " N"]:
     """Return each point's smallest depth in the views that see it; the median if none does."""
     nearest = np.full(len(xyz), np.inf)
-    columns = np.ascontiguousarray(xyz.T, np.float64)
-    # Evenly spaced views, the first and the last among them.
+    xyz = np.asfortranarray(xyz, np.float64)
     limit = max(MIN_VIEWS, MAX_PROJECTIONS // max(1, len(xyz)))
-    for i in np.unique(np.linspace(0, len(views) - 1, min(limit, len(views))).round().astype(int)):
-        depths, seen = _seen_depths(columns, views[i])
-        np.minimum(nearest, np.where(seen, depths, np.inf), out=nearest)
+    for view in [views[i] for i in evenly_spaced(len(views), limit)]:
+        rows, _, depth = points_in_image(view.camera, xyz, near=view.near, margin=MARGIN)
+        nearest[rows] = np.minimum(nearest[rows], depth)
     known = np.isfinite(nearest)
     # A point that no view sees gets no gradient; any positive depth will do.
     nearest[~known] = np.median(nearest[known]) if known.any() else 1.0
     near_plane = min((view.near for view in views), default=NEAR_PLANE)
     return np.asarray(np.maximum(nearest, near_plane), np.float32)
-
-
-def _seen_depths(
-    columns: Float[np.ndarray, "3 N"], view: View
-) -> tuple[Float[np.ndarray, " N"], Bool[np.ndarray, " N"]]:
-    """Return depths in a view, and whether points are in front of it and roughly in its frame."""
-    # Sums are written out: BLAS may add in another order when it has more threads.
-    x, y, depths = (
-        row[0] * columns[0] + row[1] * columns[1] + row[2] * columns[2] + row[3]
-        for row in view.cam_from_world[:3]
-    )
-    seen = depths > view.near
-    for across, focal, center, size in (
-        (x, view.K[0, 0], view.K[0, 2], view.width),
-        (y, view.K[1, 1], view.K[1, 2], view.height),
-    ):
-        # Multiplied by the depth, so that nothing is divided by zero.
-        seen &= focal * across >= (-MARGIN * size - center) * depths
-        seen &= focal * across <= ((1 + MARGIN) * size - center) * depths
-    return depths, seen

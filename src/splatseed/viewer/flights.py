@@ -27,7 +27,9 @@ from splatseed.photos.view import View
 from splatseed.photos.viewpoint import look_at
 from splatseed.photos.visibility import points_in_image
 from splatseed.progress import Progress, silent
+from splatseed.projection import camera_centers
 from splatseed.requirements import require
+from splatseed.sampling import evenly_spaced
 from splatseed.similarity import Similarity
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.pictures import to_uint8
@@ -179,8 +181,7 @@ def check_path(
     path: Path, views: Sequence[View], gaussians: Gaussians, cameras: Sequence[View]
 ) -> None:
     """Refuse the path of a file that misses the model or is far from all training cameras."""
-    num = min(len(views), CHECK.num_views)
-    sample = [views[i] for i in np.linspace(0, len(views) - 1, num).astype(int)]
+    sample = [views[i] for i in evenly_spaced(len(views), CHECK.num_views)]
     xyz = gaussians.means[:: max(1, len(gaussians) // CHECK.num_gaussians)].astype(np.float64)
     seen = [len(points_in_image(view.camera, xyz).depth) / len(xyz) for view in sample]
     lost = np.mean(np.array(seen) < CHECK.min_seen) > 0.5
@@ -217,8 +218,7 @@ def _in_order(views: Sequence[View]) -> list[View]:
 def _poses(views: Sequence[View]) -> Float64[np.ndarray, "V 9"]:
     """Centres, forward and up axes of views, which can be averaged."""
     poses = np.array([view.cam_from_world for view in views]).reshape(-1, 4, 4)
-    centers = -np.einsum("vij,vi->vj", poses[:, :3, :3], poses[:, :3, 3])
-    return np.hstack([centers, poses[:, 2, :3], -poses[:, 1, :3]])
+    return np.hstack([camera_centers(poses), poses[:, 2, :3], -poses[:, 1, :3]])
 
 
 def _posed(lens: View, looks: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> list[View]:

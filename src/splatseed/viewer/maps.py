@@ -20,6 +20,7 @@ from splatseed.depth.stereo import StereoMap
 from splatseed.io.files import StrPath
 from splatseed.photos.visibility import find_visibility, points_in_image
 from splatseed.pointcloud import PointCloud
+from splatseed.sampling import evenly_spaced
 from splatseed.scene import Image, Scene
 from splatseed.viewer import page
 from splatseed.viewer.points import points_over
@@ -37,9 +38,8 @@ def preview_maps(scene: Scene, maps: Sequence[StereoMap], path: StrPath, *, limi
     """
     path = Path(path)
     by_name = {image.name: image for image in scene.images}
-    rows = np.linspace(0, len(maps) - 1, min(limit, len(maps)))
     tiles: list[page.Tile] = []
-    for i in np.unique(rows.round().astype(int)):
+    for i in evenly_spaced(len(maps), limit):
         size = page.fitted(maps[i].camera.width, maps[i].camera.height, SIDE)
         photograph = page.photograph_or_blank(by_name.get(maps[i].name), size)
         tiles += map_tiles(maps[i], photograph)

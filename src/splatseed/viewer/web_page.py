@@ -22,9 +22,11 @@ from splatseed.findings import Finding
 from splatseed.io.staging import atomic_file
 from splatseed.photos.upright import up_direction
 from splatseed.photos.view import View
+from splatseed.photos.visibility import points_in_image
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.rendering.harmonics import sh_basis
 from splatseed.requirements import require
+from splatseed.sampling import evenly_spaced
 from splatseed.splat.gaussians import SH_C0, Gaussians, antialiasing_finding
 from splatseed.splat.packing import opacity_bytes, unit_quats
 from splatseed.text import counted
@@ -158,13 +160,9 @@ def mean_colors(model: Gaussians, views: tuple[View, ...]) -> UInt8[np.ndarray, 
     """
     base = 0.5 + SH_C0 * model.sh0[:, 0].astype(np.float64)
     total, weights = np.zeros((len(model), 3)), np.zeros(len(model))
-    chosen = np.unique(np.linspace(0, len(views) - 1, COLOR_VIEWS).round().astype(int))
-    for view in (views[i] for i in chosen if model.shN.size and views):
-        camera = view.camera
-        uv, depth = camera.project(model.means)
-        seen = np.flatnonzero(
-            (depth > 0) & ((uv >= 0) & (uv < [camera.width, camera.height])).all(axis=1)
-        )
+    chosen = evenly_spaced(len(views), COLOR_VIEWS) if model.shN.size else ()
+    for camera in (views[i].camera for i in chosen):
+        seen = points_in_image(camera, model.means).point_idx
         rays: Float64[np.ndarray, "M 3"] = model.means[seen] - camera.center
         distance = np.linalg.norm(rays, axis=1)
         basis = sh_basis(rays / distance[:, None], 1 + model.shN.shape[1])[:, 1:]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 
 import numba
 import numpy as np
@@ -124,7 +123,7 @@ def test_bytes_do_not_depend_on_threads(ball, monkeypatch):
     monkeypatch.setattr(pipeline, "MIN_SEEN", 1)  # so that priors are its points
     try:
         for threads in (1, 2):
-            monkeypatch.setattr(os, "cpu_count", lambda threads=threads: threads)
+            monkeypatch.setattr("splatseed.progress.available_cpus", lambda n=threads: n)
             numba.set_num_threads(min(threads, before))
             for old, new in zip(maps_of(ball), stereo_depths(ball.scene, SETTINGS), strict=True):
                 for field in ("depth", "normal", "confidence", "agreeing"):

@@ -11,7 +11,7 @@ from splatseed.errors import PointCloudError
 from splatseed.io.nerfstudio import read_cloud_transform
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
-from splatseed.seeding.clouds.align import AlignSettings, align
+from splatseed.seeding.clouds.align import AlignSettings, align_cloud
 from splatseed.seeding.clouds.global_search import SearchSettings, spread_rotations
 from splatseed.seeding.clouds.icp import Stage
 from splatseed.similarity import Similarity
@@ -66,7 +66,7 @@ def made():
 def aligned(folder, tie_xyz, xyz, settings, **arrays):
     np.savez(folder / "cloud.npz", xyz=xyz, **arrays)
     scene = Scene(PointCloud(tie_xyz, shades(tie_xyz)))
-    return align(scene, [folder / "cloud.npz"], settings=settings)
+    return align_cloud(scene, [folder / "cloud.npz"], settings=settings)
 
 
 @pytest.mark.slow

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from splatseed.seeding.clouds.icp import (
+    CloudSurface,
     RefineSettings,
-    Surface,
     clustered_covariance,
     refine,
     retract,
@@ -27,7 +27,7 @@ def corner():
     u, v = (grid.ravel() for grid in np.meshgrid(*[np.arange(0.0125, 1, 0.025)] * 2))
     z = np.zeros_like(u)
     walls = [(u, v, z), (u, z, v), (z, u, v), (u, v, z + 1), (z + 1, u, v)]
-    return Surface.of(np.concatenate([np.column_stack(wall) for wall in walls]))
+    return CloudSurface.of(np.concatenate([np.column_stack(wall) for wall in walls]))
 
 
 def points_on_walls(rng, num=600):
@@ -97,7 +97,7 @@ def test_sensitivity_is_how_the_alignment_follows_its_points(corner, rng):
 
 
 def test_one_plane_constrains_too_little(corner, rng):
-    plane = Surface.of(corner.xyz[corner.xyz[:, 2] == 0])
+    plane = CloudSurface.of(corner.xyz[corner.xyz[:, 2] == 0])
     assert refine(plane, tie_points(rng.random((500, 3)) * (1, 1, 0)), NEAR, 0.01) is None
 
 

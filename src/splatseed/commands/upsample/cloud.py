@@ -70,9 +70,9 @@ def load_cloud(options: Options, scene: Scene, method: Cloud, progress: Progress
     elif not options.align and (shift := find_shift(scene, _sample(files))).any():
         transform = Similarity(1.0, np.eye(3), shift)
     if options.align:
-        from splatseed.seeding.clouds.align import align
+        from splatseed.seeding.clouds.align import align_cloud
 
-        alignment = align(scene, files, progress)
+        alignment = align_cloud(scene, files, progress)
         transform = alignment.scene_from_cloud
     given = method.of(*files, transform=transform, memory=memory)
     return LoadedCloud(scene, given, memory_note, alignment)

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-
-import numpy as np
 
 from splatseed.commands.upsample.options import Options
 from splatseed.console import StageClock
@@ -13,7 +10,8 @@ from splatseed.io.origin import write_offset
 from splatseed.methods import Upsampler
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
-from splatseed.scene import Image, Scene
+from splatseed.sampling import evenly_spaced
+from splatseed.scene import Scene
 from splatseed.seeding.photo_methods import CELL, MAX_SIZE, Stereo, photographed, read_views
 from splatseed.splat.formats import write_gaussians
 from splatseed.training.initialization import gaussians_of_scene
@@ -56,7 +54,8 @@ def write_previews(
         clouds.preview_origins(scene, seeds, folder / ORIGINS, options.method)
         clock("preview", 0.6)
         images = photographed(scene)
-        views = read_views(scene, [images[i] for i in _some_of(images)], MAX_SIZE, silent)
+        images = tuple(images[i] for i in evenly_spaced(len(images), PHOTOGRAPHS_SHOWN))
+        views = read_views(scene, images, MAX_SIZE, silent)
         both = [cloud.xyz[cloud.finite] for cloud in (scene.points, seeds)]
         cells = zip(views, *(covered_cells(views, xyz, CELL) for xyz in both), strict=True)
         shown = [
@@ -66,12 +65,7 @@ def write_previews(
         clouds.preview_cells(shown, folder / CELLS)
     if isinstance(method, Stereo):
         # Recomputed for a few views: keeping all maps would take as much memory as the views.
-        some = _some_of(photographed(scene, method.test_every))
+        count = len(photographed(scene, method.test_every))
+        some = evenly_spaced(count, PHOTOGRAPHS_SHOWN).tolist()
         maps.preview_maps(scene, method.maps(scene, some, options.seed, clock), folder / MAPS)
     clock("preview", 1.0)
-
-
-def _some_of(images: Sequence[Image]) -> list[int]:
-    """Return the indices of at most ``PHOTOGRAPHS_SHOWN`` images, evenly spaced."""
-    places = np.linspace(0, len(images) - 1, min(PHOTOGRAPHS_SHOWN, len(images)))
-    return [int(place) for place in np.unique(places.round())]

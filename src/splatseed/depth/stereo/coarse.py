@@ -21,6 +21,8 @@ from splatseed.photos.sources import choose_by_pose, choose_sources
 from splatseed.photos.view import View
 from splatseed.photos.visibility import Visibility, points_in_image
 from splatseed.progress import Progress
+from splatseed.projection import pixel_centers
+from splatseed.sampling import evenly_spaced, strided
 
 
 @dataclass(frozen=True)
@@ -54,8 +56,7 @@ def coarse_stereo(views: Sequence[View], seed: int, progress: Progress) -> Visib
 
 def without_tracks(xyz: Float64[np.ndarray, "N 3"]) -> Visibility:
     """Visibility of points by projection only, thinned evenly to ``COARSE.max_points``."""
-    every = max(1, -(-len(xyz) // COARSE.max_points))
-    return Visibility(xyz[::every], np.empty(0, np.int64), {}, {})
+    return Visibility(strided(xyz, COARSE.max_points), np.empty(0, np.int64), {}, {})
 
 
 def prior_from_baseline(
@@ -98,8 +99,7 @@ def _inverse_depth_quantiles(
     """The 10%, 50% and 90% quantiles of each view's inverse depth, of the nearest sampled view."""
     poses = np.stack([view.cam_from_world for view in views])
     sources = choose_by_pose(poses, MATCHING.num_sources)
-    last = len(views) - 1
-    sampled = np.unique(np.linspace(0, last, COARSE.num_sampled).round().astype(np.int64))
+    sampled = evenly_spaced(len(views), COARSE.num_sampled)
     priors: list[DepthPrior | None] = [None] * len(views)
     for i in sampled:
         priors[i] = prior_from_baseline(views, int(i), sources[i])
@@ -120,7 +120,7 @@ def _hypothetical_points(
     points = []
     for view, inverse in zip(views, quantiles, strict=True):
         # 5 x 4 positions in the image, at three depths each.
-        relative = (np.indices((4, 5)).reshape(2, -1).T[:, ::-1] + 0.5) / [5, 4]
+        relative = pixel_centers(4, 5).reshape(-1, 2) / [5, 4]
         uv = np.tile(relative * [view.width, view.height], (3, 1))
         points.append(view.camera.unproject(uv, np.repeat(1 / inverse, 20)))
     xyz = np.concatenate(points)

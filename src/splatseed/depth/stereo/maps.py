@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float32, Int64, UInt8
 from splatseed.camera import Camera
 from splatseed.photos.view import View
 from splatseed.pointcloud import PointCloud
+from splatseed.projection import pixel_centers
 from splatseed.settings import Range, check_settings
 
 MIN_POINTS = 30
@@ -154,7 +155,7 @@ class StereoResult:
         normal is along -K' m, as 1 / z > 0 along every ray.
         """
         w, gx, gy = self.planes[i].astype(np.float64)
-        u, v = (np.indices(w.shape)[::-1] + 0.5) * self.settings.grid
+        u, v = np.moveaxis(pixel_centers(*w.shape) * self.settings.grid, -1, 0)
         m = np.stack([gx, gy, w - gx * u - gy * v], axis=-1)
         normal = -m @ self.views[i].K
         return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True), np.float32)

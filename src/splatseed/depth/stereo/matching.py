@@ -16,7 +16,6 @@ matched by one thread, so results do not depend on the number of threads.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -29,7 +28,8 @@ from splatseed.depth.stereo._kernels.cost import pack_quads, to_grey
 from splatseed.depth.stereo._kernels.patchmatch import QuadImages, initialise, red_black_sweep
 from splatseed.depth.stereo.maps import StereoResult, StereoSettings
 from splatseed.photos.view import View
-from splatseed.progress import Progress, in_threads
+from splatseed.progress import Progress, in_threads, num_threads
+from splatseed.projection import pixel_centers
 from splatseed.runtime.memory import check_memory
 
 BYTES_PER_DEPTH = 3 * 4 + 4 + 1
@@ -96,7 +96,7 @@ def initial_planes(
         planes = np.zeros((INITIAL.num_random, 3, rows, columns), np.float32)
         planes[:, 0] = rng.uniform(low, high, (INITIAL.num_random, rows, columns))
         return planes
-    uv = (np.indices(shape)[::-1].reshape(2, -1).T + 0.5) * grid
+    uv = pixel_centers(*shape).reshape(-1, 2) * grid
     nearest = cKDTree(prior.uv).query(uv, INITIAL.num_fitted)[1]
     num = INITIAL.num_nearest
     planes = np.zeros((num + 1, 3, rows * columns), np.float32)
@@ -155,7 +155,7 @@ def check_stereo_memory(views: Sequence[View], settings: StereoSettings) -> None
     """
     grid, sizes = settings.grid, [view.width * view.height for view in views]
     depths = sum((view.width // grid) * (view.height // grid) for view in views)
-    threads = min(os.cpu_count() or 1, len(views))
+    threads = min(num_threads(), len(views))
     quads = threads * max(sizes) * 4 * (1 + min(settings.num_sources, len(views) - 1))
     check_memory(
         depths,

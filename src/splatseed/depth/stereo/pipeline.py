@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from splatseed.depth.alignment import ray_length
 from splatseed.depth.stereo.coarse import coarse_stereo, without_tracks
 from splatseed.depth.stereo.maps import MIN_POINTS, StereoMap, StereoResult, StereoSettings
 from splatseed.depth.stereo.matching import DepthPrior, match_views
@@ -183,16 +184,12 @@ def _map_points(image: Image, depth: DepthMap) -> Float64[np.ndarray, "N 3"]:
         ((np.arange(MAP_SAMPLES) + 0.5) * side / MAP_SAMPLES).astype(np.int64)
         for side in depth.values.shape
     )
-    row, column = (axis.ravel() for axis in np.meshgrid(row, column, indexing="ij"))
+    row, column = np.repeat(row, MAP_SAMPLES), np.tile(column, MAP_SAMPLES)
     z = depth.values[row, column].astype(np.float64)
     known = np.isfinite(z) & (z > 0) & (depth.kind != "inverse")
-    uv = np.stack([column, row], axis=1)[known] + 0.5
-    z = z[known]
     if depth.kind == "ray":
-        rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1) @ np.linalg.inv(camera.K).T
-        # distance along the ray / |ray|, for rays of unit z, is planar depth
-        z /= np.linalg.norm(rays, axis=1)
-    return camera.unproject(uv, z)
+        z /= ray_length(camera, column, row)
+    return camera.unproject(np.stack([column, row], axis=1)[known] + 0.5, z[known])
 
 
 def _prior_from_points(view: View, xyz: Float64[np.ndarray, "M 3"]) -> DepthPrior | None:

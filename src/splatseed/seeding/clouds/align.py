@@ -24,9 +24,17 @@ from jaxtyping import Float64, UInt8
 from splatseed.errors import PointCloudError
 from splatseed.findings import Finding
 from splatseed.progress import Progress, silent
+from splatseed.sampling import strided
 from splatseed.scene import Scene
 from splatseed.seeding.clouds.global_search import SEARCH, SearchSettings, find_starts, to_unit_size
-from splatseed.seeding.clouds.icp import Alignment, RefinedAlignment, Stage, Surface, fit, refine
+from splatseed.seeding.clouds.icp import (
+    Alignment,
+    CloudSurface,
+    RefinedAlignment,
+    Stage,
+    fit,
+    refine,
+)
 from splatseed.seeding.clouds.reading import sample_cloud
 from splatseed.seeding.clouds.tie_points import (
     MAX_TIE_POINTS,
@@ -132,7 +140,7 @@ class CloudAlignment:
         return Finding("cloud-alignment", text, "warning" if uncertain or sensitive else "info")
 
 
-def align(
+def align_cloud(
     scene: Scene,
     paths: Sequence[Path],
     progress: Progress = silent,
@@ -150,7 +158,7 @@ def align(
     progress("align", 0.0)
     unit_from_scene, unit_from_cloud = to_unit_size(tie_points.xyz), to_unit_size(xyz)
     unit_points = tie_points.transformed(unit_from_scene)
-    surface = Surface.of(unit_from_cloud.points(xyz))
+    surface = CloudSurface.of(unit_from_cloud.points(xyz))
     first, *others = _candidates(surface, unit_points.xyz, settings, progress)
     close = settings.inlier_distance
     refined = refine(surface, unit_points, first.cloud_from_scene, close)
@@ -202,13 +210,13 @@ def _unreliable(found: str) -> PointCloudError:
 
 
 def _candidates(
-    surface: Surface, tie_xyz: Points, settings: AlignSettings, progress: Progress
+    surface: CloudSurface, tie_xyz: Points, settings: AlignSettings, progress: Progress
 ) -> list[Alignment]:
     """Return distinct alignments, best first."""
     stages = settings.stages
     starts = find_starts(surface.xyz, tie_xyz, stages[0].candidates, progress, settings.search)
     for s, stage in enumerate(stages):
-        sample = tie_xyz[:: -(-len(tie_xyz) // stage.tie_points)]
+        sample = strided(tie_xyz, stage.tie_points)
         starts = starts[: stage.candidates]
         fitted: list[Alignment] = []
         for i, start in enumerate(starts):
@@ -244,7 +252,7 @@ def _is_distinct(first: Alignment, second: Alignment, settings: AlignSettings) -
 
 def _brightness_correlation(
     alignment: Alignment,
-    surface: Surface,
+    surface: CloudSurface,
     tie_points: TiePoints,
     rgb: UInt8[np.ndarray, "N 3"] | None,
     inlier_distance: float,

@@ -37,7 +37,7 @@ BLOCK = 1 << 15
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class CloudSurface:
     """A cloud to align with: points, unit normals of either sign, and a tree."""
 
     xyz: Points
@@ -45,7 +45,7 @@ class Surface:
     tree: cKDTree
 
     @classmethod
-    def of(cls, xyz: Points) -> Surface:
+    def of(cls, xyz: Points) -> CloudSurface:
         """Estimate normals as the last principal axis of a point and its 11 nearest."""
         tree, normals = cKDTree(xyz, balanced_tree=False), np.empty_like(xyz)
         for start in range(0, len(xyz), BLOCK):
@@ -108,7 +108,7 @@ class Stage(NamedTuple):
     inlier_distance: float  # by which the candidates are ranked
 
 
-def fit(surface: Surface, tie_xyz: Points, start: Similarity, stage: Stage) -> Alignment:
+def fit(surface: CloudSurface, tie_xyz: Points, start: Similarity, stage: Stage) -> Alignment:
     """Fit an alignment by ICP, with a reach that shrinks as the stage prescribes.
 
     Raises:
@@ -131,7 +131,7 @@ def _require_inliers(used: np.ndarray) -> None:
 
 
 def _step(
-    surface: Surface, tie_xyz: Points, start: Similarity, reach: float
+    surface: CloudSurface, tie_xyz: Points, start: Similarity, reach: float
 ) -> tuple[Similarity, float]:
     """Do one iteration; return the new similarity and the largest change of a parameter."""
     q, limit = start.points(tie_xyz), reach * start.scale
@@ -171,7 +171,7 @@ def retract(start: Similarity, center: np.ndarray, x: np.ndarray) -> Similarity:
 
 
 def _residuals(
-    surface: Surface, tie_xyz: Points, similarity: Similarity, reach: float
+    surface: CloudSurface, tie_xyz: Points, similarity: Similarity, reach: float
 ) -> tuple[Float64[np.ndarray, " M"], Bool[np.ndarray, " M"]]:
     """Return residuals as ``Alignment`` has them, and which tie points are within reach."""
     limit = reach * similarity.scale
@@ -234,7 +234,7 @@ class _Problem(NamedTuple):
 
 
 def refine(
-    surface: Surface,
+    surface: CloudSurface,
     tie_points: TiePoints,
     start: Similarity,
     reach: float,
@@ -267,7 +267,7 @@ def refine(
     return RefinedAlignment(similarity, residuals, covariance, center, sensitivity[:3])
 
 
-def _patches(surface: Surface, q: Points, settings: RefineSettings) -> _Patches:
+def _patches(surface: CloudSurface, q: Points, settings: RefineSettings) -> _Patches:
     nearest = surface.tree.query(q)[1]
     num = min(settings.neighbors, len(surface.xyz))
     points = surface.xyz[surface.tree.query(surface.xyz[nearest], num)[1]]

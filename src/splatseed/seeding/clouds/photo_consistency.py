@@ -28,16 +28,16 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8, UInt16
 
 from splatseed.errors import PointCloudError
-from splatseed.photos.projection import pixels_from_world
 from splatseed.photos.view import View
 from splatseed.photos.visibility import points_in_image
 from splatseed.photos.zbuffer import cell_counts
 from splatseed.progress import Progress
+from splatseed.sampling import strided
 from splatseed.seeding.clouds._kernels import count_by_cell, observe, sum_around, summarise
 from splatseed.seeding.clouds.voxels import Voxels
 from splatseed.seeding.cover import cell_depths_of_views
 
-Surface = Float32[np.ndarray, "rows cols"]
+SurfaceDepths = Float32[np.ndarray, "rows cols"]
 
 
 @dataclass(frozen=True)
@@ -92,8 +92,8 @@ def find_support(
 def free_space(
     views: Sequence[View],
     visible: Sequence[Float64[np.ndarray, "M 3"]],
-    stereo_depths: Sequence[Surface] | None = None,
-) -> tuple[Surface, ...]:
+    stereo_depths: Sequence[SurfaceDepths] | None = None,
+) -> tuple[SurfaceDepths, ...]:
     """Return the depth up to which each view's rays are free, per cell; infinite if unknown.
 
     It is the smallest depth of the points that a view certainly sees, ``visible``, and of the maps
@@ -134,7 +134,7 @@ class Evidence(NamedTuple):
 
 def find_surfaces(
     views: Sequence[View], xyz: Float32[np.ndarray, "N 3"], progress: Progress
-) -> tuple[tuple[Surface, ...], int]:
+) -> tuple[tuple[SurfaceDepths, ...], int]:
     """Return the surface of each view, and the side of its cells in pixels."""
     cell = _choose_cell(views, xyz)
     return tuple(cell_depths_of_views(views, xyz, cell, progress, "find surfaces")), cell
@@ -142,7 +142,7 @@ def find_surfaces(
 
 def _choose_cell(views: Sequence[View], xyz: Float32[np.ndarray, "N 3"]) -> int:
     """Return the smallest side at which the median non-empty cell holds enough points."""
-    sample = views[:: -(-len(views) // 8)]
+    sample = strided(views, 8)
     for cell in SETTINGS.cells[:-1]:
         counts = np.concatenate([cell_counts(view.camera, xyz, cell) for view in sample])
         counts = counts[counts > 0]
@@ -154,9 +154,9 @@ def _choose_cell(views: Sequence[View], xyz: Float32[np.ndarray, "N 3"]) -> int:
 def find_evidence(
     views: Sequence[View],
     xyz: Float32[np.ndarray, "N 3"],
-    surfaces: Sequence[Surface],
+    surfaces: Sequence[SurfaceDepths],
     cell: int,
-    free: Sequence[Surface] | None,
+    free: Sequence[SurfaceDepths] | None,
     progress: Progress,
 ) -> Evidence:
     """Compare points with photographs.
@@ -187,7 +187,7 @@ def find_evidence(
         samples = np.zeros((len(block), closest, 3), np.uint8)
         for v, view in enumerate(views):
             observe(
-                block, pixels_from_world(view.camera),
+                block, view.camera.pixels_from_world,
                 np.sqrt(abs(view.K[0, 0] * view.K[1, 1])), view.width, view.height, surfaces[v],
                 behind, no_rays if free is None else free[v], view.photograph,
                 no_mask if view.mask is None else view.mask, closeness, samples,
@@ -200,7 +200,7 @@ def find_evidence(
 
 def surface_agreement(
     views: Sequence[View],
-    surfaces: Sequence[Surface],
+    surfaces: Sequence[SurfaceDepths],
     visible: Sequence[Float64[np.ndarray, "M 3"]],
 ) -> tuple[float, int]:
     """Compare a scene's visible points with a cloud's surface.
@@ -238,7 +238,7 @@ def consistent_voxels(
     progress: Progress,
     *,
     clean: bool = True,
-    free: Sequence[Surface] | None = None,
+    free: Sequence[SurfaceDepths] | None = None,
 ) -> ConsistentVoxels:
     """Select the voxels that photographs see and do not contradict.
 

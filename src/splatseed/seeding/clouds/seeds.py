@@ -23,7 +23,7 @@ from splatseed.progress import Note, Progress, silent
 from splatseed.scene import Image, Scene
 from splatseed.seeding.clouds.photo_consistency import (
     ConsistentVoxels,
-    Surface,
+    SurfaceDepths,
     consistent_voxels,
     free_space,
 )
@@ -127,7 +127,7 @@ def _free_space(
     visible: Sequence[Float64[np.ndarray, "M 3"]],
     rng: np.random.Generator,
     progress: Progress,
-) -> Sequence[Surface] | None:
+) -> Sequence[SurfaceDepths] | None:
     """Return how far rays are free: up to tracked points, and up to what stereo confirms."""
     certain = visible if scene.tracks is not None else [np.empty((0, 3))] * len(views)
     if not scene.has_photographs or len(views) < 2:

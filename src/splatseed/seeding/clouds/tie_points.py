@@ -16,6 +16,8 @@ from jaxtyping import Float64, Int64
 
 from splatseed.errors import PointCloudError
 from splatseed.pointcloud import ORIGINAL
+from splatseed.projection import in_camera, pixel_jacobians
+from splatseed.sampling import strided
 from splatseed.scene import Image, Scene, Tracks
 from splatseed.similarity import Similarity
 
@@ -64,7 +66,7 @@ def select_tie_points(scene: Scene) -> TiePoints:
             found=f"{len(rows):,}",
             fix="Make some: splatseed sfm IMAGES --poses-from SCENE; or pass `transform`.",
         )
-    rows = rows[:: -(-len(rows) // MAX_TIE_POINTS)]
+    rows = strided(rows, MAX_TIE_POINTS)
     xyz = points.xyz[rows].astype(np.float64)
     covariance, sensitivity = np.full((len(rows), 3, 3), np.nan), np.zeros((len(rows), 3, 2))
     if tracks is not None:
@@ -103,10 +105,7 @@ def triangulation(
 def _jacobians(
     tracks: Tracks, images: tuple[Image, ...]
 ) -> tuple[Int64[np.ndarray, " T"], Float64[np.ndarray, "T 2 3"]]:
-    """Return the point of each observation, and the Jacobian d pixel / d point.
-
-    u = f x / z + c gives du/dX = (f / z) (r_x - (x / z) r_z), r_x and r_z rows of the rotation.
-    """
+    """Return the point of each observation, and the Jacobian d pixel / d point."""
     if not images:
         return np.zeros(0, np.int64), np.zeros((0, 2, 3))
     ids = np.array([image.image_id for image in images])
@@ -115,13 +114,11 @@ def _jacobians(
     point = np.repeat(np.arange(len(tracks)), tracks.lengths)
     poses = np.stack([image.camera.cam_from_world for image in images])[row]
     focals = np.stack([np.diag(image.camera.K)[:2] for image in images])[row]
-    x = np.einsum("nij,nj->ni", poses[:, :3, :3], tracks.xyz[point]) + poses[:, :3, 3]
+    x = in_camera(poses, tracks.xyz[point])
     usable = (ids[row] == tracks.image_ids) & (
         x[:, 2] > MIN_RELATIVE_DEPTH * np.linalg.norm(x, axis=1)
     )
-    poses, focals, x = poses[usable], focals[usable], x[usable]
-    off_axis = (x[:, :2] / x[:, 2:])[:, :, None] * poses[:, None, 2, :3]
-    return point[usable], (focals / x[:, 2:])[:, :, None] * (poses[:, :2, :3] - off_axis)
+    return point[usable], pixel_jacobians(focals[usable], poses[usable], x[usable])
 
 
 def pixel_noise(

@@ -17,7 +17,6 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt8
 
-from splatseed.photos.projection import pixels_from_world
 from splatseed.photos.view import View
 from splatseed.seeding.clouds._kernels import (
     OUTSIDE,
@@ -60,7 +59,7 @@ class Voxels:
         self._has_views, self._level = bool(views), 0
         self.coarsening = self.total = self.num_outside = 0
         if views:
-            matrices = np.stack([pixels_from_world(view.camera) for view in views])
+            matrices = np.stack([view.camera.pixels_from_world for view in views])
             focals = [np.sqrt(abs(view.K[0, 0] * view.K[1, 1])) for view in views]
             self._matrices = matrices.astype(np.float32)
             self._sides = (pixels / np.array(focals)).astype(np.float32)
