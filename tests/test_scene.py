@@ -13,7 +13,7 @@ from splatseed.depth.stereo import StereoMap
 from splatseed.depthmap import DepthMap
 from splatseed.errors import ParameterError, SceneNotFoundError, UnknownNameError
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import NO_POINT, Image, Observations, Scene, Tracks
+from splatseed.scene import NO_POINT, Image, Masks, Observations, Scene, SceneSource, Tracks
 from splatseed.similarity import Similarity
 
 INTRINSICS = Intrinsics(1, "PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0))
@@ -149,6 +149,24 @@ def test_images_by_name(room, room_path):
     assert "no.jpg" not in room
     with pytest.raises(TypeError):
         iter(room)
+
+
+def test_a_scene_made_in_memory_has_no_files():
+    scene = Scene(PointCloud.empty(), (_image("a.jpg"),))
+    source, image = scene.source, scene.images[0]
+    assert (source.format, source.root, source.again, source.inputs) == ("memory", None, None, ())
+    assert (scene.has_photographs, image.has_photograph, image.size) == (False, False, None)
+    assert image.lens is image.intrinsics
+    with pytest.raises(SceneNotFoundError, match="a folder that holds the photograph a"):
+        image.read()
+
+
+def test_images_follow_their_scene(room):
+    moved = room.replace(source=dataclasses.replace(room.source, image_dir=room.source.root))
+    assert not moved.has_photographs
+    assert room.replace(source=SceneSource()).images[0].folder is None
+    masks = Masks({}, alpha=False)
+    assert room.replace(masks=masks).images[-1].masks is masks
 
 
 def test_an_unknown_name_lists_near_ones():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 
@@ -50,6 +51,16 @@ def test_a_colmap_scene(room, splatseed, monkeypatch):
     advised = run.out.partition("\nnext\n")[2]
     assert re.findall(r"splatseed (\w+)", advised) == ["train", "train", "info"]
     assert rows["photographs agree"].endswith("of the pixels compared: enough")
+
+
+def test_sizes_are_those_of_the_files(room, tmp_path, splatseed):
+    own = shutil.copytree(room, tmp_path / "own", symlinks=False)
+    for path in (own / "images").iterdir():
+        PilImage.open(path).resize((48, 36)).save(path)
+    rows, facts = _pairs(splatseed("info", own).out), splatseed("info", own, "--json").out
+    assert rows["cameras"] == "1 PINHOLE 48x36"
+    assert rows["photographs agree"].endswith("of the pixels compared: enough")
+    assert [(c["width"], c["height"]) for c in json.loads(facts)["cameras"]] == [(48, 36)]
 
 
 @pytest.mark.parametrize("name", ["model.ply", "model.spz", "model.splat", "model.sog"])
