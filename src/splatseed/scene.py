@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace as dataclass_replace
 from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8, UInt32
@@ -30,7 +30,8 @@ from splatseed.pointcloud import PointCloud
 NO_POINT = -1
 """Point id of a feature without a point."""
 
-SceneFormat = Literal["colmap", "transforms", "ply", "rgbd", "llff", "phone", "memory"]
+OPENCV = "with OpenCV's camera axes (x right, y down, z forward)"
+OPENGL = "with OpenGL's camera axes (x right, y up, z back)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,7 +224,7 @@ class Tracks:
 class SceneSource:
     """Where a scene was read from; without any path, it was made in memory."""
 
-    format: SceneFormat = "memory"
+    format: str = "memory"  # of its files: "colmap", "transforms", "phone", ...
     root: Path | None = None  # the scene's folder; of a bare PLY, the one it lies in
     points_path: Path | None = None  # of the points; of a capture without any, a file of the poses
     model_dir: Path | None = None  # COLMAP's, if there is one
@@ -231,6 +232,7 @@ class SceneSource:
     transforms_path: Path | None = None  # if it was read
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # recorded beside its files
     named: Path | None = None  # what the user named, which may be one model or file of several
+    convention: str = f"poses are cam_from_world, {OPENCV}"  # of the files' poses, as a clause
 
     @property
     def again(self) -> Path | None:

@@ -26,7 +26,7 @@ from splatseed.io.photograph_checks import photograph_findings
 from splatseed.io.ply import read_ply_float64
 from splatseed.io.point_files import differing_points, first_with_points
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import Image, Scene, SceneSource, Tracks
+from splatseed.scene import OPENCV, Image, Scene, SceneSource, Tracks
 from splatseed.text import counted
 
 IMAGE_DIRS = ("images", "images_2", "images_4", "images_8", "image", "input")
@@ -172,7 +172,8 @@ def read_colmap_scene(model_dir: StrPath) -> Scene:
             " splatseed sfm IMAGES -o SCENE. Points can be interpolated, but not trained."
         )
         findings.append(Finding("missing-poses", text))
-    source = SceneSource("colmap", root, points_path, model_dir, image_dir)
+    convention = f"the model's images hold cam_from_world, {OPENCV}"
+    source = SceneSource("colmap", root, points_path, model_dir, image_dir, convention=convention)
     scene = Scene(
         points, images, intrinsics, tracks, source, tuple(findings), absent=tuple(unusable)
     )

@@ -29,6 +29,7 @@ from splatseed.scene import Image, Scene, SceneSource
 from splatseed.text import counted
 
 POSES = "poses_bounds.npy"
+_CONVENTION = "poses_bounds.npy holds world_from_cam, with camera axes down, right, back"
 _OPENCV_FROM_LLFF = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 """Columns: LLFF's axes (down, right, back) in OpenCV's (right, down, forward)."""
 _MAX_BYTES = 1 << 28
@@ -59,7 +60,7 @@ def read_llff(root: StrPath) -> Scene:
         PointCloud.empty(),
         tuple(images),
         tuple(cameras.values()),
-        source=SceneSource("llff", root, path, image_dir=folder),
+        source=SceneSource("llff", root, path, image_dir=folder, convention=_CONVENTION),
         findings=tuple(photograph_findings(images, folder, root)),
     )
     return recentered(scene)

@@ -54,6 +54,17 @@ _TRANSFORMS = "transforms.json"
 _MAX_LEVELS_UP = 3
 """How many parent folders of a file are searched for its scene."""
 _SCAN_SUFFIXES = frozenset({".las", ".laz", ".e57", ".pcd", ".xyz", ".asc", ".pts", ".glb"})
+READERS = (
+    (is_llff, read_llff),
+    (is_replica, load_rgbd),
+    (is_tum, load_tum),
+    (is_scanner_app, read_scanner_app),
+    (is_polycam, read_polycam),
+    (is_record3d, read_record3d),
+    (is_stray, read_stray),
+)
+"""Formats of folders without a COLMAP model or transforms.json: what recognises one by its files,
+and what reads it as a ``Scene``."""
 _TRIANGULATE = (
     "Method auto needs none: splatseed upsample SCENE -o OUT. Or make points with: splatseed sfm"
     " IMAGES --poses-from SCENE -o OUT."
@@ -162,16 +173,7 @@ def _reader(folder: Path) -> Callable[[], Scene] | None:
         return partial(read_blender, folder)
     if (nested := nested_model(folder)) is not None:
         return partial(read_model, nested)
-    others = (
-        (is_llff, read_llff),
-        (is_replica, load_rgbd),
-        (is_tum, load_tum),
-        (is_scanner_app, read_scanner_app),
-        (is_polycam, read_polycam),
-        (is_record3d, read_record3d),
-        (is_stray, read_stray),
-    )
-    return next((partial(read, folder) for known, read in others if known(folder)), None)
+    return next((partial(read, folder) for known, read in READERS if known(folder)), None)
 
 
 def _read_file(path: Path) -> Scene:

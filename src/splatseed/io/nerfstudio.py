@@ -60,7 +60,7 @@ from splatseed.io.picture import open_picture
 from splatseed.io.ply import read_ply_float64
 from splatseed.io.point_files import differing_points
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import Image, Masks, Scene, SceneSource, Split
+from splatseed.scene import OPENGL, Image, Masks, Scene, SceneSource, Split
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
 from splatseed.text import counted
 
@@ -70,6 +70,7 @@ OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _FIX = "Correct the file, or export the scene again."
+_CONVENTION = f"each transform_matrix is world_from_cam, {OPENGL}"
 NERFSTUDIO = "dataparser_transforms.json"
 _MATRIX_KEYS = ("transform", "matrix", "transform_matrix", "transformation")
 _MATRIX_FIX = "Write 3 or 4 rows of 4 numbers, as text or JSON."
@@ -118,8 +119,9 @@ def read_transforms_scene(path: StrPath) -> Scene:
     points, exact, points_path, found = _find_points(transforms)
     images, folder = transforms.images, transforms.image_dir
     source = SceneSource(
-        "transforms", path.parent, points_path, image_dir=folder, transforms_path=path
-    )
+        "transforms", path.parent, points_path, image_dir=folder, transforms_path=path,
+        convention=_CONVENTION,
+    )  # fmt: skip
     frames = {i.name: f.fields for i, f in zip(images, transforms.frames, strict=True)}
     masks, gone = named_masks(FrameFiles(path), frames)
     depths, lost = named_depths(FrameFiles(path), frames, transforms.json)
@@ -178,7 +180,9 @@ def read_blender(folder: StrPath) -> Scene:
         points,
         tuple(images),
         tuple(cameras.values()),
-        source=SceneSource("transforms", folder, points_path, image_dir=folder),
+        source=SceneSource(
+            "transforms", folder, points_path, image_dir=folder, convention=_CONVENTION
+        ),
         findings=(
             *dict.fromkeys(findings),  # both files may have the same
             *photograph_findings(images, folder, folder),

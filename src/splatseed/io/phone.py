@@ -31,11 +31,12 @@ from splatseed.io.nerfstudio import OPENCV_FROM_OPENGL
 from splatseed.io.origin import recentered
 from splatseed.io.photograph_checks import photograph_findings
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import Image, Scene, SceneSource
+from splatseed.scene import OPENGL, Image, Scene, SceneSource
 
 EXPORT_AGAIN = "Export the scan again."
 HALF_PIXEL = 0.5
 """From ARKit's principal point, counted from the first pixel's centre, to the image corner's."""
+_CONVENTION = f"the app's poses are world_from_cam, {OPENGL}, as ARKit has them"
 _MAX_OFFSET = 0.1
 """Largest plausible distance of the principal point from the middle, in image sizes: phones' are
 within 0.03, and a photograph resized to 3/4 has 0.17."""
@@ -95,7 +96,7 @@ def read_phone_scene(
         PointCloud.empty(),
         tuple(images),
         tuple(cameras.values()),
-        source=SceneSource("phone", root, track, image_dir=folder),
+        source=SceneSource("phone", root, track, image_dir=folder, convention=_CONVENTION),
         findings=findings,
         absent=tuple(unusable),
     )

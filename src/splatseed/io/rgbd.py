@@ -27,7 +27,7 @@ from splatseed.io.origin import recentered
 from splatseed.io.photograph import lens_findings
 from splatseed.io.photograph_checks import photograph_size
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import Image, Scene, SceneSource
+from splatseed.scene import OPENCV, Image, Scene, SceneSource
 from splatseed.text import agreeing, counted
 
 _FRAME = re.compile(r"frame(\d+)\.(?:jpe?g|png)", re.IGNORECASE)
@@ -102,7 +102,8 @@ def load_rgbd(root: StrPath) -> Scene:
 def _scene(
     track: Path, folder: Path, images: Sequence[Image], lens: Intrinsics, *findings: Finding
 ) -> Scene:
-    source = SceneSource("rgbd", track.parent, track, image_dir=folder)
+    convention = f"its trajectory holds world_from_cam, {OPENCV}"
+    source = SceneSource("rgbd", track.parent, track, image_dir=folder, convention=convention)
     points = PointCloud.empty()
     return recentered(Scene(points, tuple(images), (lens,), source=source, findings=findings))
 

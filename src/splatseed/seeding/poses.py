@@ -79,17 +79,6 @@ CORRECTIONS: Mapping[str, Callable[[Poses], Poses]] = MappingProxyType(
         ),
     }
 )
-_OPENCV = "with OpenCV's camera axes (x right, y down, z forward)"
-CONVENTIONS = {
-    "colmap": f"the model's images hold cam_from_world, {_OPENCV}",
-    "llff": "poses_bounds.npy holds world_from_cam, with camera axes down, right, back",
-    "phone": "the app's poses are world_from_cam, with OpenGL's camera axes (x right, y up, z "
-    "back), as ARKit has them",
-    "rgbd": f"its trajectory holds world_from_cam, {_OPENCV}",
-    "transforms": "each transform_matrix is world_from_cam, with OpenGL's camera axes (x right, "
-    "y up, z back)",
-}
-"""The convention of each format's poses."""
 
 
 class InexactPosesError(SceneFormatError):
@@ -125,7 +114,7 @@ def check_poses(scene: Scene, images: Sequence[Image], progress: Progress = sile
             raise SceneFormatError(
                 expected,
                 found=f"{found}, and at {corrected[best]:.0%} once {best}",
-                fix=f"Write the poses so: {CONVENTIONS[scene.source.format]}.",
+                fix=f"Write the poses so: {scene.source.convention}.",
             )
         if agreement > max(clear * corrected[best], POSE_CHECK.chance):
             # The poses are sound; the mean agreement needs more than one photograph.
