@@ -18,6 +18,7 @@ from jaxtyping import Float32, Float64, UInt8
 from splatseed.camera import Camera, same_shape
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError, UnknownNameError
 from splatseed.frozen import read_only
+from splatseed.projection import scaled
 from splatseed.text import did_you_mean
 
 DepthKind = Literal["z", "ray", "inverse"]
@@ -93,8 +94,7 @@ class DepthMap:
                 found=f"{self.width} x {self.height}",
                 fix="Make depth from the images of this scene, or resize both alike.",
             )
-        K: Float64[np.ndarray, "3 3"] = np.diag([*scale, 1.0]) @ camera.K
-        return Camera(K, self.width, self.height, camera.cam_from_world)
+        return Camera(scaled(camera.K, *scale), self.width, self.height, camera.cam_from_world)
 
 
 @runtime_checkable

@@ -44,6 +44,13 @@ def project(matrix: Float64[np.ndarray, "3 4"], xyz: Float[np.ndarray, "N 3"]) -
         return Projected(across * inverse, down * inverse, depth)
 
 
+def scaled(
+    K: Float64[np.ndarray, "3 3"], x: float, y: float | None = None
+) -> Float64[np.ndarray, "3 3"]:
+    """K of an image with ``x`` times the columns, and ``y`` (by default ``x``) times the rows."""
+    return np.asarray(np.diag([x, x if y is None else y, 1.0]) @ K)
+
+
 def pixel_centers(rows: int, columns: int) -> Float64[np.ndarray, "rows columns 2"]:
     """(column, row) of the centre of each pixel, or of each cell of a grid."""
     column, row = np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5)

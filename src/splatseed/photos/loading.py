@@ -29,6 +29,7 @@ from splatseed.lens import undistort_advice
 from splatseed.photos.sizes import check_side
 from splatseed.photos.view import View
 from splatseed.progress import Progress, silent
+from splatseed.projection import scaled
 from splatseed.runtime.memory import check_memory
 from splatseed.scene import Image, Scene
 
@@ -137,7 +138,7 @@ def _load_view(image: Image, data_factor: int, min_side: int, cache_dir: Path | 
     height, width = photograph.shape[:2]
     check_side(image.path, min_side, data_factor, (width, height))
     lens = image.lens
-    K = np.diag([1 / data_factor, 1 / data_factor, 1.0]) @ lens.K
+    K = scaled(lens.K, 1 / data_factor)
     camera = Camera(K, width, height, image.camera.cam_from_world)
     mask = image.read_mask(data_factor)
     if not lens.has_distortion:

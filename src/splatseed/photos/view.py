@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Float64, UInt8
 from splatseed.camera import Camera
 from splatseed.errors import ParameterError
 from splatseed.photos.sizes import check_side
+from splatseed.projection import scaled
 from splatseed.scene import Image
 
 NEAR_PLANE = 0.01  # gsplat's near plane, where nothing is known of the scene
@@ -80,11 +81,11 @@ def camera_views(images: Sequence[Image], data_factor: int = 1) -> tuple[View, .
     Raises:
         SceneFormatError: A photograph would have no pixel.
     """
-    views, shrink = [], np.diag([1 / data_factor, 1 / data_factor, 1.0])
+    views = []
     for image in images:
         camera = image.camera
         width, height = camera.width // data_factor, camera.height // data_factor
         check_side(image.name, 1, data_factor, (width, height))
-        small = Camera(shrink @ camera.K, width, height, camera.cam_from_world)
+        small = Camera(scaled(camera.K, 1 / data_factor), width, height, camera.cam_from_world)
         views.append(View(image.name, NO_PIXELS, small))
     return tuple(views)

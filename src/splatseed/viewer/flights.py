@@ -27,7 +27,7 @@ from splatseed.photos.view import View
 from splatseed.photos.viewpoint import look_at
 from splatseed.photos.visibility import points_in_image
 from splatseed.progress import Progress, silent
-from splatseed.projection import camera_centers
+from splatseed.projection import camera_centers, scaled
 from splatseed.requirements import require
 from splatseed.sampling import evenly_spaced
 from splatseed.similarity import Similarity
@@ -239,7 +239,7 @@ def _lens(views: Sequence[View], size: tuple[int, int]) -> View:
     view = sorted(views, key=lambda view: view.K[1, 1] / view.height)[len(views) // 2]
     width, height = size
     scale = height / view.height
-    K = np.diag([scale, scale, 1.0]) @ view.K
+    K = scaled(view.K, scale)
     K[0, 2] += (width - scale * view.width) / 2
     camera = Camera(K, width, height, view.cam_from_world)
     return dataclasses.replace(view, camera=camera)

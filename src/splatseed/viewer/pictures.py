@@ -26,6 +26,7 @@ from splatseed.methods import source_name
 from splatseed.photos.undistortion import undistort
 from splatseed.photos.view import View, camera_views
 from splatseed.pointcloud import PointCloud
+from splatseed.projection import scaled
 from splatseed.scene import Image, Scene
 from splatseed.seeding.cover import covered_cells
 from splatseed.splat.gaussians import Gaussians
@@ -103,7 +104,7 @@ def warp_to_canvas(
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Warp a camera's picture of any size to a canvas with the same pose; black outside."""
     height, width = picture.shape[:2]
-    K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
+    K = scaled(camera.K, width / camera.width, height / camera.height)
     picture_from_canvas = K @ np.linalg.inv(canvas.K)
     resample = PillowImage.Resampling.BILINEAR if smooth else PillowImage.Resampling.NEAREST
     size, rows = (canvas.width, canvas.height), tuple(picture_from_canvas[:2].ravel().tolist())

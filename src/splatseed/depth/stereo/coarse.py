@@ -21,7 +21,7 @@ from splatseed.photos.sources import choose_by_pose, choose_sources
 from splatseed.photos.view import View
 from splatseed.photos.visibility import Visibility, points_in_image
 from splatseed.progress import Progress
-from splatseed.projection import pixel_centers
+from splatseed.projection import pixel_centers, scaled
 from splatseed.sampling import evenly_spaced, strided
 
 
@@ -85,7 +85,7 @@ def _downsampled(view: View) -> View:
     """Downsample a view by a whole factor to about ``COARSE.side`` pixels."""
     factor = max(1, round(max(view.width, view.height) / COARSE.side))
     image = block_means(view.photograph, factor)
-    K = np.diag([1 / factor, 1 / factor, 1.0]) @ view.K
+    K = scaled(view.K, 1 / factor)
     mask = None
     if view.mask is not None:
         mask = block_means(view.mask[..., None].astype(np.uint8), factor)[..., 0] > 0

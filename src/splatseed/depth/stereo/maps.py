@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float32, Int64, UInt8
 from splatseed.camera import Camera
 from splatseed.photos.view import View
 from splatseed.pointcloud import PointCloud
-from splatseed.projection import pixel_centers
+from splatseed.projection import pixel_centers, scaled
 from splatseed.settings import Range, check_settings
 
 MIN_POINTS = 30
@@ -129,7 +129,7 @@ class StereoResult:
         """The map of view i."""
         view, valid, grid = self.views[i], self.confirmed(i), self.settings.grid
         height, width = valid.shape
-        K = np.diag([1 / grid, 1 / grid, 1.0]) @ view.K
+        K = scaled(view.K, 1 / grid)
         depth = np.where(valid, 1.0 / self.planes[i][0], np.nan).astype(np.float32)
         normal = np.where(valid[..., None], self.normals(i), np.nan).astype(np.float32)
         names = tuple(self.views[j].name for j in self.sources[i] if j >= 0)

@@ -27,14 +27,7 @@ from splatseed.progress import Progress, silent
 from splatseed.sampling import strided
 from splatseed.scene import Scene
 from splatseed.seeding.clouds.global_search import SEARCH, SearchSettings, find_starts, to_unit_size
-from splatseed.seeding.clouds.icp import (
-    Alignment,
-    CloudSurface,
-    RefinedAlignment,
-    Stage,
-    fit,
-    refine,
-)
+from splatseed.seeding.clouds.icp import CloudSurface, RefinedFit, SimilarityFit, Stage, fit, refine
 from splatseed.seeding.clouds.reading import sample_cloud
 from splatseed.seeding.clouds.tie_points import (
     MAX_TIE_POINTS,
@@ -211,14 +204,14 @@ def _unreliable(found: str) -> PointCloudError:
 
 def _candidates(
     surface: CloudSurface, tie_xyz: Points, settings: AlignSettings, progress: Progress
-) -> list[Alignment]:
+) -> list[SimilarityFit]:
     """Return distinct alignments, best first."""
     stages = settings.stages
     starts = find_starts(surface.xyz, tie_xyz, stages[0].candidates, progress, settings.search)
     for s, stage in enumerate(stages):
         sample = strided(tie_xyz, stage.tie_points)
         starts = starts[: stage.candidates]
-        fitted: list[Alignment] = []
+        fitted: list[SimilarityFit] = []
         for i, start in enumerate(starts):
             with suppress(np.linalg.LinAlgError):
                 alignment = fit(surface, sample, start, stage)
@@ -226,7 +219,7 @@ def _candidates(
                     fitted.append(alignment)
             progress("align", (s + (i + 1) / len(starts)) / len(stages))
         fitted.sort(key=lambda alignment: -alignment.inlier_ratio(stage.inlier_distance))
-        kept: list[Alignment] = []
+        kept: list[SimilarityFit] = []
         for alignment in fitted:
             if all(_is_distinct(alignment, better, settings) for better in kept):
                 kept.append(alignment)
@@ -236,7 +229,7 @@ def _candidates(
     return kept
 
 
-def _is_distinct(first: Alignment, second: Alignment, settings: AlignSettings) -> bool:
+def _is_distinct(first: SimilarityFit, second: SimilarityFit, settings: AlignSettings) -> bool:
     """Whether two alignments, of clouds at unit size, are not variants of one."""
     a, b = first.cloud_from_scene, second.cloud_from_scene
     cosine = (np.trace(a.rotation.T @ b.rotation) - 1) / 2
@@ -251,7 +244,7 @@ def _is_distinct(first: Alignment, second: Alignment, settings: AlignSettings) -
 
 
 def _brightness_correlation(
-    alignment: Alignment,
+    alignment: SimilarityFit,
     surface: CloudSurface,
     tie_points: TiePoints,
     rgb: UInt8[np.ndarray, "N 3"] | None,
@@ -269,7 +262,7 @@ def _brightness_correlation(
     return float(np.corrcoef(brightness, tie_points.brightness[inliers])[0, 1])
 
 
-def _max_error(alignment: RefinedAlignment, tie_xyz: Points) -> float:
+def _max_error(alignment: RefinedFit, tie_xyz: Points) -> float:
     """Return the standard error at the farthest corner of the tie points, in extents."""
     q = alignment.cloud_from_scene.points(np.percentile(tie_xyz, (2, 98), axis=0))
     corners = np.stack(np.meshgrid(*q.T, indexing="ij"), axis=-1).reshape(-1, 3) - alignment.center

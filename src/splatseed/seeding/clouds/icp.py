@@ -67,7 +67,7 @@ class CloudSurface:
 
 
 @dataclass(frozen=True, eq=False)
-class Alignment:
+class SimilarityFit:
     """A similarity, and the residuals of the tie points in scene units.
 
     A residual is the distance from the nearest point's tangent plane, or, beyond the reach, from
@@ -83,7 +83,7 @@ class Alignment:
 
 
 @dataclass(frozen=True, eq=False)
-class RefinedAlignment(Alignment):
+class RefinedFit(SimilarityFit):
     """The result of ``refine``, with its uncertainty."""
 
     covariance: Float64[np.ndarray, "7 7"]  # rotation about the center, shift, log scale; cloud's
@@ -108,7 +108,7 @@ class Stage(NamedTuple):
     inlier_distance: float  # by which the candidates are ranked
 
 
-def fit(surface: CloudSurface, tie_xyz: Points, start: Similarity, stage: Stage) -> Alignment:
+def fit(surface: CloudSurface, tie_xyz: Points, start: Similarity, stage: Stage) -> SimilarityFit:
     """Fit an alignment by ICP, with a reach that shrinks as the stage prescribes.
 
     Raises:
@@ -122,7 +122,7 @@ def fit(surface: CloudSurface, tie_xyz: Points, start: Similarity, stage: Stage)
         reach = max(reach * stage.decay, stage.last_reach)
     residuals, inliers = _residuals(surface, tie_xyz, similarity, reach)
     _require_inliers(inliers)
-    return Alignment(similarity, residuals)
+    return SimilarityFit(similarity, residuals)
 
 
 def _require_inliers(used: np.ndarray) -> None:
@@ -173,7 +173,7 @@ def retract(start: Similarity, center: np.ndarray, x: np.ndarray) -> Similarity:
 def _residuals(
     surface: CloudSurface, tie_xyz: Points, similarity: Similarity, reach: float
 ) -> tuple[Float64[np.ndarray, " M"], Bool[np.ndarray, " M"]]:
-    """Return residuals as ``Alignment`` has them, and which tie points are within reach."""
+    """Return residuals as ``SimilarityFit`` has them, and which tie points are within reach."""
     limit = reach * similarity.scale
     _, off, distance = surface.pairs(similarity.points(tie_xyz))
     inside = (np.abs(off) < limit) & (distance < 2 * limit)
@@ -239,7 +239,7 @@ def refine(
     start: Similarity,
     reach: float,
     settings: RefineSettings = REFINEMENT,
-) -> RefinedAlignment | None:
+) -> RefinedFit | None:
     """Refine a nearly correct alignment to the precision of the tie points.
 
     Tie points are at unit extent; residuals beyond ``reach`` get no weight. Returns None if too few
@@ -264,7 +264,7 @@ def refine(
         return None
     # At the reach of the last stage of ``fit``, so that inlier ratios compare.
     residuals, _ = _residuals(surface, tie_points.xyz, similarity, reach / 2)
-    return RefinedAlignment(similarity, residuals, covariance, center, sensitivity[:3])
+    return RefinedFit(similarity, residuals, covariance, center, sensitivity[:3])
 
 
 def _patches(surface: CloudSurface, q: Points, settings: RefineSettings) -> _Patches:
