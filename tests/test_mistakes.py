@@ -46,7 +46,7 @@ def test_points_of_ones_own_are_counted_where_upsampling_leaves_them_out(room):
     seeds = ss.upsample(own, "mls", ratio=2, note=notes.append)
     assert len(seeds) == 2 * len(room.points)
     assert len(notes) == 1
-    assert notes[0].startswith("1 point")
+    assert notes[0].text.startswith("1 point")
     ss.upsample(room, "mls", ratio=2, note=notes.append)
     assert len(notes) == 1
 

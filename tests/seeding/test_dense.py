@@ -148,6 +148,6 @@ def test_size_and_grid_follow_from_the_spacing(finest, expected, few):
     """Photographs of 1,800 pixels, which the first comparison reduced by 3."""
     image = few.images[0]
     lens = image.intrinsics.resized(1800, 1350)
-    images = [dataclasses.replace(image, intrinsics=lens)] * 2
+    images = [dataclasses.replace(image, intrinsics=lens, folder=None)] * 2
     plans = plan_comparisons(images, 3, 4, finest, 1000)
     assert [(plan.factor, plan.grid, plan.split) for plan in plans] == expected
