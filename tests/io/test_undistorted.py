@@ -11,8 +11,8 @@ from PIL import Image as PilImage
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError
 from splatseed.io import find_depths
+from splatseed.io.depth_maps import LENSES, write_lenses
 from splatseed.io.load import with_depths_in
-from splatseed.io.undistorted import LENSES, write_lenses
 from splatseed.lens import project_rays
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource

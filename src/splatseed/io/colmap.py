@@ -28,7 +28,7 @@ from splatseed.io.camera_records import (
     format_error,
     make_intrinsics,
 )
-from splatseed.io.files import ByteReader, StrPath, numbered_lines
+from splatseed.io.files import ByteReader, StrPath, is_data, numbered_lines
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import NO_POINT, Image, Observations, Tracks
 
@@ -329,7 +329,7 @@ def _text_images(path: Path) -> Iterator[tuple[Any, ...]]:
     """Yield images as ``_binary_images`` does; each has a second line with its features."""
     lines = numbered_lines(path)
     for where, line in lines:
-        if not _is_data(line):
+        if not is_data(line):
             continue
         row = line.strip().split(maxsplit=9)  # a name may hold spaces
         with _parsed(where, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", row):
@@ -387,9 +387,4 @@ def _parsed(where: str, layout: str, row: Sequence[str]) -> Iterator[None]:
 
 
 def _data_lines(path: Path) -> Iterator[tuple[str, str]]:
-    return (each for each in numbered_lines(path) if _is_data(each[1]))
-
-
-def _is_data(line: str) -> bool:
-    stripped = line.lstrip()
-    return bool(stripped) and not stripped.startswith("#")
+    return (each for each in numbered_lines(path) if is_data(each[1]))

@@ -19,7 +19,7 @@ from splatseed.errors import SceneNotFoundError, SplatseedError
 from splatseed.findings import Finding
 from splatseed.io.camera_records import Unusable, check_enough, unusable_findings, unusable_images
 from splatseed.io.colmap import MIN_IMAGE_BYTES, read_cameras, read_images, read_points3d
-from splatseed.io.files import StrPath, numbered_lines, open_file
+from splatseed.io.files import StrPath, is_data, numbered_lines, open_file
 from splatseed.io.origin import recentered
 from splatseed.io.photograph import lens_findings
 from splatseed.io.photograph_checks import photograph_findings
@@ -85,7 +85,7 @@ def _count_lines(path: Path) -> int:
     """Count the images of ``images.txt``: two lines each, of which the second may be blank."""
     count, lines = 0, numbered_lines(path)
     for _, line in lines:
-        if line.strip() and not line.lstrip().startswith("#"):
+        if is_data(line):
             count += 1
             next(lines, None)
     return count

@@ -14,7 +14,6 @@ from pathlib import Path
 from splatseed.depthmap import DepthKind
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError, SplatseedError
 from splatseed.findings import Finding, without_kinds
-from splatseed.io.bit_depth import find_white
 from splatseed.io.cleaning import clean_scene, outlier_findings
 from splatseed.io.colmap_model import find_model, nested_model, read_model, scene_model, scene_root
 from splatseed.io.depth_files import KINDS, SUFFIXES
@@ -22,6 +21,7 @@ from splatseed.io.depth_maps import (
     DISTORTED_MAPS,
     WITHOUT_CONFIDENCE,
     DepthFiles,
+    fitted_to_undistorted,
     map_findings,
     match_by_name,
 )
@@ -29,6 +29,7 @@ from splatseed.io.files import StrPath, is_video, special_kind
 from splatseed.io.llff import is_llff, read_llff
 from splatseed.io.nerfstudio import is_blender, read_blender, read_transforms_scene
 from splatseed.io.origin import recentered
+from splatseed.io.picture import find_white
 from splatseed.io.ply import read_ply_float64, refuse_gaussians
 from splatseed.io.polycam import is_polycam, read_polycam
 from splatseed.io.record3d import (
@@ -39,14 +40,12 @@ from splatseed.io.record3d import (
     read_r3d,
     read_record3d,
 )
-from splatseed.io.recorded import restore_absent, with_recorded_masks
 from splatseed.io.rgbd import find_tum_depths, is_replica, is_tum, load_rgbd, load_tum
 from splatseed.io.scanner_app import is_scanner_app, read_scanner_app
-from splatseed.io.seeds import recall_seeds
+from splatseed.io.seeds import recall_seeds, restore_absent, with_recorded_masks
 from splatseed.io.split import with_listed_split
 from splatseed.io.staging import MANIFEST, read_manifest
 from splatseed.io.stray import is_stray, read_stray
-from splatseed.io.undistorted import fitted_to_undistorted
 from splatseed.scene import Scene, SceneSource
 from splatseed.text import name_some, quoted
 

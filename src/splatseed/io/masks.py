@@ -21,12 +21,12 @@ from PIL import Image as PilImage
 from splatseed.camera import Intrinsics, same_shape
 from splatseed.errors import SceneFormatError, SceneNotFoundError, SplatseedError
 from splatseed.findings import Finding, without_kinds
-from splatseed.io.bit_depth import is_16_bit, opaque_value, read_16_bit
 from splatseed.io.depth_maps import Undistortion
 from splatseed.io.files import files_below, read_bytes, translate_errors
 from splatseed.io.mask_files import SUFFIXES, find_masks, find_own_masks, masks_among
 from splatseed.io.photograph import has_alpha, open_photograph, photograph_bytes
 from splatseed.io.photograph_checks import photograph_size
+from splatseed.io.picture import is_16_bit, opaque_value, read_16_bit
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.sampling import strided
 from splatseed.scene import Masks, Scene
@@ -172,7 +172,7 @@ def read_mask(
         with translate_errors(path, "a mask, an image of one channel"):
             picture = open_photograph(path, read_bytes(path))
             marked = _read_counts(picture) != masks.inverted
-        size = open_photograph(photograph, photograph_bytes(photograph)).size
+        size = photograph_size(photograph)
         if not same_shape(picture.size, size):
             raise SceneFormatError(
                 f"the mask {path} to have the size of {name}, {size[0]} x {size[1]}",
@@ -257,7 +257,7 @@ def write_masks(
             fitting = _undistorted(counts, *lenses[name]) if lenses else counts
             _write(folder / f"{name}.png", fitting)
     for name in unmasked if folder.is_dir() else ():
-        width, height = open_photograph(image_dir / name, photograph_bytes(image_dir / name)).size
+        width, height = photograph_size(image_dir / name)
         if lenses:
             width, height = lenses[name][1].width, lenses[name][1].height
         _write(folder / f"{name}.png", np.ones((height, width), np.bool_))

@@ -20,6 +20,7 @@ from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError
 from splatseed.findings import Finding
 from splatseed.io.camera_records import (
+    OPENCV_FROM_OPENGL,
     NotFiniteError,
     check_enough,
     make_intrinsics,
@@ -27,11 +28,11 @@ from splatseed.io.camera_records import (
     unusable_findings,
 )
 from splatseed.io.files import read_json
-from splatseed.io.nerfstudio import OPENCV_FROM_OPENGL
 from splatseed.io.origin import recentered
 from splatseed.io.photograph_checks import photograph_findings
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
+from splatseed.text import agreeing, counted
 
 EXPORT_AGAIN = "Export the scan again."
 HALF_PIXEL = 0.5
@@ -100,6 +101,15 @@ def read_phone_scene(
         absent=tuple(unusable),
     )
     return recentered(scene)
+
+
+def without_photograph(count: int, total: int, noun: str) -> list[Finding]:
+    """Report records of an export that have no photograph, if any."""
+    if not count:
+        return []
+    have = agreeing(count, "has no photograph and is", "have no photograph and are")
+    text = f"{count} of {counted(total, noun)} {have} left out."
+    return [Finding("missing-photographs", text)]
 
 
 def _camera(frame: PhoneFrame, camera_id: int) -> Intrinsics:

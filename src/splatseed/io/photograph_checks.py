@@ -6,7 +6,6 @@ as in COLMAP: EXIF orientation is ignored. Only headers are read.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -18,10 +17,10 @@ from PIL import Image as PilImage
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.findings import Finding
-from splatseed.io.extraction import is_extracted
-from splatseed.io.files import open_file, similar_name, special_kind, translate_errors
+from splatseed.io.files import absolute, open_file, similar_name, special_kind, translate_errors
 from splatseed.io.photograph import COPY_AGAIN, photograph_bytes, photograph_folder
 from splatseed.io.picture import ORIENTATION, open_picture
+from splatseed.io.recordings import is_extracted
 from splatseed.scene import Image, Scene
 from splatseed.text import agreeing, counted, name_some
 
@@ -165,9 +164,8 @@ def photograph_findings(
     absent = {im.name: None for im in images if not im.has_photograph}
     findings = [_missing([*absent], len(images), image_dir)] if absent else []
     # Links are not followed: users make them on purpose.
-    around = os.path.abspath(root)  # noqa: PTH100
-    paths = {im.name: os.path.abspath(im.path) for im in images}  # noqa: PTH100
-    outside = [n for n, path in paths.items() if os.path.commonpath([path, around]) != around]
+    around = absolute(root)
+    outside = [im.name for im in images if around not in absolute(im.path).parents]
     if outside and not is_extracted(image_dir):
         lie = agreeing(len(outside), "lies", "lie")
         text = f"{len(outside)} of {len(images)} images {lie} outside of {root}"
@@ -183,7 +181,7 @@ def _odd_cameras(images: Sequence[Image]) -> list[Finding]:
     if not odd:
         return []
     lens = odd[0].intrinsics
-    fx, fy, cx, cy = lens.K[[0, 1, 0, 1], [0, 1, 2, 2]]
+    fx, fy, cx, cy = lens.pinhole.params
     of = f"{len(odd)} of {counted(len(images), 'image')}"
     what = f"The focal lengths and principal point of {of} are probably not in pixels of this size"
     such = f"({fx:.4g}, {fy:.4g}) and ({cx:.4g}, {cy:.4g}) in {lens.width} x {lens.height}"

@@ -30,11 +30,10 @@ from jaxtyping import Float64
 from PIL import Image as PilImage
 
 from splatseed.camera import rotation_from_quat
-from splatseed.errors import MissingDependencyError, SceneFormatError, SceneNotFoundError
+from splatseed.errors import MissingDependencyError, SceneNotFoundError
 from splatseed.findings import Finding
-from splatseed.io.camera_records import check_pose
+from splatseed.io.camera_records import check_pose, check_unit_quat
 from splatseed.io.depth_maps import DepthFiles, find_confidences
-from splatseed.io.extraction import extracted
 from splatseed.io.files import (
     COPY_AGAIN,
     StrPath,
@@ -43,8 +42,8 @@ from splatseed.io.files import (
     translate_errors,
     translate_read_errors,
 )
-from splatseed.io.film import choose_photographs
 from splatseed.io.phone import PhoneFrame, read_phone_scene
+from splatseed.io.recordings import choose_photographs, chosen_finding, extracted
 from splatseed.progress import Progress
 from splatseed.requirements import require
 from splatseed.runtime.fingerprint import fingerprint
@@ -55,8 +54,6 @@ ARCHIVE = ".r3d"
 """The suffix of Record3D's archives."""
 _EXPORT = "EXR_RGBD"
 _PHOTOGRAPH = re.compile(r"(\d{1,9})\.(jpe?g|png)", re.IGNORECASE)
-_NORM_SLACK = 0.01
-"""Largest plausible error of a quaternion's length."""
 _MAX_MEMBER = 1 << 28
 """Bytes of the largest plausible photograph or map in an archive."""
 _FIX = 'In the app, export the recording again, as "EXR + RGB" or as .r3d.'
@@ -232,10 +229,7 @@ class _Metadata:
         where = f"{self.path}, pose {number}"
         quat, center = self.poses[number, [3, 0, 1, 2]], self.poses[number, 4:]
         check_pose((*quat, *center), f"of {name}", where)
-        if abs(np.linalg.norm(quat) - 1) > _NORM_SLACK:
-            numbers = " ".join(f"{each:g}" for each in self.poses[number])
-            expected = f"a quaternion of length 1, then a position, in {where}"
-            raise SceneFormatError(expected, found=numbers, fix=_FIX)
+        check_unit_quat(quat, where, _FIX)
         pose = np.column_stack([rotation_from_quat(quat), center])
         stored = self.pinholes[number].tolist() if number < len(self.pinholes) else self.pinhole
         fx, fy, cx, cy = map(float, stored)
@@ -307,9 +301,7 @@ def _choose(
     focal = metadata.pinhole[0] / metadata.size[0]
     chosen = choose_photographs(details, rotations.reshape(-1, 3, 3), centers[usable], focal)
     if len(chosen) < len(known):
-        which = "the sharpest at equal distances of the camera's motion"
-        text = f"{len(chosen):,} of {len(known):,} photographs are used: {which}."
-        findings.append(Finding("chosen-photographs", text, "info"))
+        findings.append(chosen_finding(f"{len(chosen):,} of {len(known):,} photographs"))
         posed = [known[index] for index in chosen.tolist()]
     return [found[number] for number in posed], findings
 

@@ -16,7 +16,9 @@ from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.errors import OutputError
 from splatseed.findings import Finding
 from splatseed.io import nerfstudio
+from splatseed.io.camera_records import OPENCV_FROM_OPENGL
 from splatseed.io.colmap_layout import Written, without_zero_distortion, write_colmap_layout
+from splatseed.io.files import absolute
 from splatseed.io.frame_files import Found, FrameFiles
 from splatseed.io.image_folders import (
     copy_files,
@@ -146,7 +148,7 @@ def _new_json(scene: Scene, A: Float64[np.ndarray, "3 4"] | None) -> dict[str, A
         shared = {"camera_model": shared.get("camera_model", "OPENCV")}
     frames = []
     for image in scene.images:
-        pose = image.camera.world_from_cam @ nerfstudio.OPENCV_FROM_OPENGL
+        pose = image.camera.world_from_cam @ OPENCV_FROM_OPENGL
         if A is not None:
             pose[:3] = A @ pose
         own = {} if len(used) == 1 else cameras[image.intrinsics.camera_id]
@@ -172,9 +174,8 @@ def _camera_fields(camera: Intrinsics) -> dict[str, Any]:
             fix="Undistort the scene first (splatseed undistort), or write the COLMAP layout.",
         )
     terms = camera.params[CAMERA_MODELS[camera.model].num_focal + 2 :]
-    matrix = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     fields = {"camera_model": model, "w": camera.width, "h": camera.height}
-    fields |= zip(_FIELDS[2:], matrix, strict=True)
+    fields |= zip(_FIELDS[2:], camera.pinhole.params, strict=True)
     return fields | dict(zip(_TERMS[model], (*terms, 0.0, 0.0, 0.0, 0.0), strict=False))
 
 
@@ -191,11 +192,11 @@ def _kept_json(transforms: nerfstudio.Transforms, names: Collection[str]) -> dic
         """Return a path to the same file from another folder of this computer."""
         if not isinstance(path, str):
             return path
-        file, plain = there.get(path), Path(os.path.abspath(root / path))  # noqa: PTH100
+        file, plain = there.get(path), absolute(root / path)
         if file and file.path != plain:  # without its suffix, say, which nerfstudio needs
             path = Path(os.path.relpath(file.path, root)).as_posix()
         if os.path.normpath(path).startswith(".."):
-            return os.path.abspath(root / path)  # noqa: PTH100  (resolve would follow links)
+            return str(absolute(root / path))
         return path
 
     frames: dict[bool, list[dict[str, Any]]] = {False: [], True: []}
@@ -234,7 +235,7 @@ def _missing_fields(fields: Mapping[str, Any], camera: Intrinsics) -> dict[str, 
     nerfstudio and OpenSplat need them, and ``camera_model``, where others take ``camera_angle_x``
     and the middle of the photograph.
     """
-    values = camera.width, camera.height, *camera.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    values = camera.width, camera.height, *camera.pinhole.params
     known = dict(zip(_FIELDS, values, strict=True))
     return {name: value for name, value in known.items() if fields.get(name) is None}
 
