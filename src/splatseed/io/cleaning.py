@@ -123,7 +123,6 @@ def _slots(images: Sequence[Image], tracks: Tracks) -> Int64[np.ndarray, " T"]:
 def _with_point_ids(
     images: Sequence[Image], point_ids: Int64[np.ndarray, " S"]
 ) -> tuple[Image, ...]:
-    """Set the point ids of all slots."""
     pieces = np.split(point_ids, np.cumsum(_feature_counts(images))[:-1])
     # zip is not strict: without images, np.split returns one empty piece.
     return tuple(

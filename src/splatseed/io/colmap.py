@@ -292,7 +292,6 @@ def write_points3d(path: StrPath, points: PointCloud, tracks: Tracks | None) -> 
 
 
 def _joined_records(heads: np.ndarray, tracks: Tracks) -> UInt8[np.ndarray, " B"]:
-    """Build the records of points with tracks."""
     observations = np.empty(len(tracks.image_ids), _OBSERVATION)
     observations["image_id"], observations["point2d_idx"] = tracks.image_ids, tracks.point2d_idx
     starts = tracks.offsets * _PAIR_BYTES + np.arange(len(heads) + 1) * _HEAD_BYTES

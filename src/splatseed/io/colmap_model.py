@@ -43,7 +43,12 @@ def scene_model(root: Path) -> Path | None:
 
 def nested_model(root: Path) -> Path | None:
     """Find the model in ``colmap/sparse``, nerfstudio's place for it."""
-    return largest_model(root / "colmap/sparse") or find_model(root / "colmap/sparse")
+    return next(iter(models_in(root / "colmap/sparse")), None)
+
+
+def models_in(folder: Path) -> list[Path]:
+    """Return the models in a folder of numbered ones, most images first, or the folder itself."""
+    return ranked_models(folder) or [each for each in (folder,) if find_model(each)]
 
 
 def largest_model(folder: Path) -> Path | None:
@@ -200,8 +205,7 @@ def read_model_cameras(
 ) -> tuple[tuple[Intrinsics, ...], tuple[Image, ...], Unusable]:
     """Read the usable camera and image records of a model, and the errors of the others.
 
-    Raises:
-        NotFiniteError: Fewer than half of the images are usable.
+    Raises ``NotFiniteError`` if fewer than half of the images are usable.
     """
     cameras_path, images_path = model_file(model_dir, "cameras"), model_file(model_dir, "images")
     if cameras_path is None and images_path is not None:

@@ -97,7 +97,7 @@ class DepthFiles:
     paths: Mapping[str, Path]
     """The maps' files by image name."""
     kind: DepthKind | None = None
-    """Meaning of the values; None: as the file declares, else planar z."""
+    """Meaning of the values; None: planar z."""
     scale: float | None = None
     """Stored units per scene unit; None: 1000 for integers, 1 for floats."""
     lens: Undistortion | None = None
@@ -132,8 +132,8 @@ class DepthFiles:
         if path is None:
             fix = "Skip this image."
             raise SceneNotFoundError(f"a depth map of {name}", found="none", fix=fix)
-        stored, declared = read_stored(path)
-        kind, is_integer = self.kind or declared or "z", stored.dtype.kind in "ui"
+        stored = read_stored(path)
+        kind, is_integer = self.kind or "z", stored.dtype.kind in "ui"
         divisor = self.scale or (_INTEGER_SCALE if is_integer else 1.0)
         with np.errstate(over="ignore", invalid="ignore"):  # becomes infinite, and so NaN
             values: np.ndarray = (stored / np.float64(divisor)).astype(np.float32)
@@ -217,7 +217,7 @@ def fitted_to_undistorted(scene: Scene, maps: DepthFiles) -> DepthFiles:
     if not cameras:
         return maps
     name, camera = next(iter(cameras.items()))
-    height, width = read_stored(maps.paths[name]).values.shape
+    height, width = read_stored(maps.paths[name]).shape
     lens = before[name]
     same_size = (width, height) == (lens.width, lens.height) != (camera.width, camera.height)
     same_shape = (

@@ -158,12 +158,7 @@ def read_bytes(path: Path) -> bytes:
 
 @contextmanager
 def translate_read_errors(path: Path) -> Iterator[None]:
-    """Turn an ``OSError`` from reading a file into a ``SplatseedError``.
-
-    Raises:
-        SceneNotFoundError: There is no such file.
-        SceneFormatError: It cannot be read (a folder, no permission, a failing disk).
-    """
+    """Turn an ``OSError`` from reading a file into a ``SplatseedError``."""
     try:
         yield
     except SplatseedError:
@@ -180,13 +175,7 @@ def translate_read_errors(path: Path) -> Iterator[None]:
 
 @contextmanager
 def translate_errors(path: Path, expected: str, *, fix: str = COPY_AGAIN) -> Iterator[None]:
-    """Turn any exception from parsing a file into ``SceneFormatError``.
-
-    Args:
-        path: The file.
-        expected: The expected content, for the message "expected PATH to be ...".
-        fix: Advice for the user.
-    """
+    """Turn any exception from parsing a file into ``SceneFormatError``, "PATH to be EXPECTED"."""
     try:
         yield
     except SplatseedError:

@@ -181,7 +181,6 @@ def find_frames(path: Path, meta: Any) -> tuple[list[Frame], list[Finding]]:
 
 
 def _listed(path: Path, meta: Any) -> list[_Listed]:
-    """List all frames of a file, training and test."""
     frames = meta.get("frames") if isinstance(meta, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
         found = "another type" if frames else "none"
@@ -201,7 +200,6 @@ def _listed(path: Path, meta: Any) -> list[_Listed]:
 
 
 def _moved(path: Path, listed: Sequence[_Listed]) -> list[Finding]:
-    """Report photographs found in another place than named."""
     moved = {each.name: each.found.path for each in listed if each.found and each.found.relocated}
     if not moved:
         return []

@@ -77,7 +77,6 @@ def _read_rows(path: Path) -> Float64[np.ndarray, "N 17"]:
 
 
 def _photographs(root: Path, count: int) -> tuple[Path, list[str]]:
-    """Find the first folder with one photograph per pose, and their sorted names."""
     found = dict[Path, list[str]]()
     for folder in (root / name for name in IMAGE_DIRS):
         names = image_names(folder)

@@ -150,7 +150,6 @@ def is_scene(folder: StrPath) -> bool:
 
 
 def _reader(folder: Path) -> Callable[[], Scene] | None:
-    """Choose the reader of a folder by the names of its files."""
     if read_manifest(folder).get("format") == "both" and (folder / _TRANSFORMS).is_file():
         return partial(read_transforms_scene, folder / _TRANSFORMS)  # it says more: masks, depth
     if (model := scene_model(folder)) is not None:
@@ -270,7 +269,7 @@ def find_depths(
         path: A folder of maps named like the images, subfolders included; a COLMAP dense workspace;
             an RGB-D capture in NICE-SLAM's or TUM's layout; a recording of Record3D; or the output
             of ``splatseed depth``.
-        kind: Meaning of the values; None: as the folder or file declares, else planar z.
+        kind: Meaning of the values; None: as the folder declares, else planar z.
         scale: Stored units per scene unit; None: as the folder declares, else 1000 for integers
             and 1 for floats.
 
@@ -326,7 +325,6 @@ def _with_maps(scene: Scene, maps: DepthFiles | None) -> Scene:
 
 
 def _same_maps(maps: DepthFiles, others: DepthFiles) -> bool:
-    """Whether two sets of maps are the same files, in the same unit."""
     if maps.scale != others.scale or maps.paths.keys() != others.paths.keys():
         return False
     return all(path.samefile(others.paths[name]) for name, path in maps.paths.items())

@@ -155,11 +155,7 @@ def read_mask(
 ) -> Bool[np.ndarray, "h w"] | None:
     """Read which pixels of a photograph are valid; None if all are.
 
-    Args:
-        masks: The scene's masks.
-        name: The image's name.
-        photograph: The image's file.
-        factor: Integer reduction; a reduced pixel is valid if its ``factor``^2 block is.
+    A pixel reduced by an integer ``factor`` is valid if all ``factor``^2 are.
 
     Raises:
         SceneNotFoundError: The mask's file is missing.
@@ -271,7 +267,6 @@ def _write(path: Path, counts: Bool[np.ndarray, "H W"]) -> None:
 def _undistorted(
     counts: Bool[np.ndarray, "H W"], lens: Intrinsics, pinhole: Intrinsics
 ) -> Bool[np.ndarray, "h w"]:
-    """Undistort a mask."""
     if lens == pinhole:  # the photograph is a copy
         return counts
     # Undistortion interpolates four pixels, all within one pixel of the nearest.

@@ -32,12 +32,7 @@ from splatseed.io.camera_records import (
     rigid_pose,
     unusable_findings,
 )
-from splatseed.io.colmap_model import (
-    find_model,
-    ranked_models,
-    read_model_cameras,
-    read_model_points,
-)
+from splatseed.io.colmap_model import models_in, read_model_cameras, read_model_points
 from splatseed.io.files import (
     StrPath,
     absolute,
@@ -247,7 +242,6 @@ def read_transforms(path: Path) -> Transforms:
 
 
 def _check_repeated(where: str, first: Image, again: Image) -> None:
-    """Raise ``SceneFormatError`` if frames give an image two poses or cameras."""
     same = np.allclose(first.quat, again.quat) and np.allclose(first.translation, again.translation)
     if not same or first.intrinsics != again.intrinsics:
         expected = f"{where} to have an image of its own"
@@ -378,15 +372,12 @@ def _find_points(
 def _models(root: Path) -> list[Path]:
     """List the COLMAP models near a ``transforms.json``, most likely first."""
     places = (root / "colmap/sparse", root / "sparse")
-    found = next(filter(None, map(ranked_models, places)), [])
-    flat = find_model(*places)
-    return found or ([flat] if flat else [])
+    return next(filter(None, map(models_in, places)), [])
 
 
 def _points_of_model(
     transforms: Transforms, model_dir: Path, findings: list[Finding]
 ) -> tuple[PointCloud, Float64[np.ndarray, "N 3"], Path, list[Finding]]:
-    """Read the points of a COLMAP model and map them into the transforms' space."""
     points, exact, _, points_path = read_model_points(model_dir)
     model_images = read_model_cameras(model_dir)[1]
     transform, doubts = _transform_of_model(transforms, model_dir, model_images)

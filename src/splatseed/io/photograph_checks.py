@@ -63,12 +63,7 @@ def with_photographs(scene: Scene) -> Scene:
 
 
 def photograph_size(path: Path) -> Size:
-    """Read width and height of an image file, once for each version of it.
-
-    Raises:
-        SceneNotFoundError: No such file.
-        SceneFormatError: Unreadable, or no image.
-    """
+    """Read width and height of an image file, once for each version of it."""
     if not path.is_file():
         photograph_bytes(path)  # raises with advice for a missing file
     with translate_errors(path, "an image", fix=COPY_AGAIN):
@@ -121,7 +116,6 @@ def check_sizes(images: Sequence[Image]) -> dict[str, Size]:
 
 
 def _misfit(image: Image, size: Size) -> tuple[str, str]:
-    """Explain why a photograph does not fit its camera, and how to fix it."""
     if not fits(image.intrinsics, size[::-1]):
         return "cropped, or stretched", (
             "Use the photographs of the reconstruction, or resized copies. A crop "
@@ -176,7 +170,6 @@ def photograph_findings(
 
 
 def _odd_cameras(images: Sequence[Image]) -> list[Finding]:
-    """Find focal lengths and principal points that are probably of another image size."""
     odd = [image for image in images if _is_of_another_size(image.intrinsics)]
     if not odd:
         return []

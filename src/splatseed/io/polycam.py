@@ -55,12 +55,7 @@ def _keyframes(folder: Path) -> Path | None:
 
 
 def read_polycam(root: StrPath) -> Scene:
-    """Read key frames, corrected ones if there are any, with depth maps; the cloud is empty.
-
-    Raises:
-        SceneNotFoundError: There are no cameras or no photographs.
-        SceneFormatError: A camera is malformed.
-    """
+    """Read key frames, corrected ones if there are any, with depth maps; the cloud is empty."""
     root = Path(root)
     keyframes = _keyframes(root) or root
     prefix, names, cameras = _choose(keyframes)

@@ -97,13 +97,7 @@ def is_rgbd_video(path: Path) -> bool:
 
 
 def read_record3d(folder: StrPath) -> Scene:
-    """Read an export's folder or an unpacked archive, with its depth maps; the cloud is empty.
-
-    Raises:
-        SceneNotFoundError: There are no metadata, or there is no photograph.
-        SceneFormatError: The metadata are malformed.
-        OutputError: The cache, into which the maps of an archive are extracted, cannot be written.
-    """
+    """Read an export's folder or an unpacked archive, with its depth maps; the cloud is empty."""
     found = _find(Path(folder))
     assert found is not None  # noqa: S101  (is_record3d)
     root, layout = found
@@ -128,13 +122,7 @@ def read_record3d(folder: StrPath) -> Scene:
 
 
 def read_r3d(path: StrPath) -> Scene:
-    """Read an archive, whose photographs and depth maps are extracted into the user's cache.
-
-    Raises:
-        SceneNotFoundError: There is no such file, or no photograph in it.
-        SceneFormatError: It is no archive of Record3D, or damaged.
-        OutputError: The cache cannot be written.
-    """
+    """Read an archive, whose photographs and depth maps are extracted into the user's cache."""
     path = Path(path)
     with _opened(path) as archive, translate_errors(path, "an archive of Record3D"):
         data = _read_within(archive, _R3D.metadata)
@@ -190,7 +178,6 @@ def _scene(
 
 
 def _lacking(package: str) -> list[Finding]:
-    """Report that a package is not installed which depth maps need."""
     try:
         require(package)
     except MissingDependencyError as error:
@@ -200,7 +187,6 @@ def _lacking(package: str) -> list[Finding]:
 
 
 def _number(name: str) -> int:
-    """Return the number of a photograph's pose."""
     return int(Path(name).stem)
 
 
@@ -219,12 +205,7 @@ class _Metadata:
     pinholes: Float64[np.ndarray, "M 4"]  # of the first M frames, if stored
 
     def frame(self, name: str) -> PhoneFrame:
-        """Return a photograph's camera and pose.
-
-        Raises:
-            NotFiniteError: The pose is not finite, or zero.
-            SceneFormatError: The quaternion is not of length 1.
-        """
+        """Return a photograph's camera and pose."""
         number = _number(name)
         where = f"{self.path}, pose {number}"
         quat, center = self.poses[number, [3, 0, 1, 2]], self.poses[number, 4:]
@@ -273,10 +254,7 @@ def _choose(
 ) -> tuple[list[str], list[Finding]]:
     """Return the photographs to use in order of their numbers, and findings about the others.
 
-    Args:
-        metadata: The recording's.
-        sizes: Bytes of the files beside the photographs, and of these, by name.
-        where: The recording.
+    ``sizes`` are bytes of the files beside the photographs, and of these, by name.
     """
     found = {_number(name): name for name in sorted(sizes) if _PHOTOGRAPH.fullmatch(name)}
     posed = [number for number in sorted(found) if number < len(metadata.poses)]
@@ -314,7 +292,6 @@ _Read = Callable[[str], bytes | None]
 
 @contextmanager
 def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
-    """Open an archive; raises as ``read_r3d``."""
     with translate_read_errors(path):
         file = open_file(path)
     with file:
@@ -353,13 +330,8 @@ def _unpack(
 ) -> tuple[Path, list[Finding]]:
     """Extract some photographs and their maps; return the folder, and a finding if maps lack.
 
-    Args:
-        source: The archive.
-        facts: Identifies its content.
-        metadata: The archive's.
-        names: The photographs.
-        read: Reads a member.
-        photographs: Extract photographs as well, not their maps alone.
+    ``facts`` identify the content of the archive ``source``; without ``photographs``, the maps
+    alone are extracted.
     """
     lacking = _lacking("lzfse")
 

@@ -118,11 +118,8 @@ def choose_photographs(
 ) -> Int64[np.ndarray, " P"]:
     """Choose among the photographs of a recording: all, unless there are too many.
 
-    Args:
-        details: Higher for the sharper of two photographs of the same content.
-        rotations: As of ``pose_motion``, likewise the others.
-        centers: Of the cameras.
-        focal: In image widths.
+    ``details`` are higher for the sharper of two photographs of the same content; the others are
+    the arguments of ``pose_motion``.
     """
     if len(details) <= FILM.max_photographs:
         return np.arange(len(details))
@@ -144,10 +141,7 @@ def small_frames(
 ) -> Iterator[Float32[np.ndarray, "H W"]]:
     """Yield all frames in grey, ``ANALYSIS_WIDTH`` wide, values from 0 to 255.
 
-    Args:
-        video: The file.
-        progress: Called with the fraction of the video that is read.
-        hidden: Also yield frames that the file's edit list hides from players.
+    ``hidden``: also those that the file's edit list hides from players.
 
     Raises:
         MissingDependencyError: imageio-ffmpeg is not installed.
@@ -230,15 +224,10 @@ def _frames(
 
 
 def extracted(source: Path, facts: object, fill: Callable[[Path, Progress], None]) -> Path:
-    """Return the folder of what ``fill`` extracts from a file; fill it if there is none yet.
+    """Return the folder of what ``fill`` extracts from ``source``; fill it if there is none yet.
 
-    Args:
-        source: The file or folder, for the name.
-        facts: What determines the content: fingerprints and settings.
-        fill: Writes into an empty folder.
-
-    Raises:
-        OutputError: The cache cannot be written.
+    ``facts`` determine the content: fingerprints and settings. Raises ``OutputError`` if the cache
+    cannot be written.
     """
     base = _base()
     folder = base / f"{source.stem}-{fingerprint(facts)[:16]}"

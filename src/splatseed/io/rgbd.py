@@ -213,7 +213,6 @@ def _read_intrinsics(path: Path) -> Intrinsics:
 
 
 def _check_image(path: Path, intrinsics: Intrinsics) -> None:
-    """Check that an image has the size of its camera; only its header is read."""
     expected = (intrinsics.width, intrinsics.height)
     size = photograph_size(path)
     if size != expected:
@@ -225,7 +224,6 @@ def _check_image(path: Path, intrinsics: Intrinsics) -> None:
 
 
 def _read_list(path: Path) -> tuple[Float64[np.ndarray, " N"], tuple[str, ...]]:
-    """Read times and relative paths of ``rgb.txt`` or ``depth.txt``, sorted by time."""
     records = []
     for where, fields in _records(path, 2):
         name = PurePosixPath(fields[1].replace("\\", "/"))

@@ -57,12 +57,7 @@ def is_photograph(name: str) -> bool:
 
 
 def read_scanner_app(root: StrPath) -> Scene:
-    """Read the frames that have a photograph, with their depth maps; the cloud is empty.
-
-    Raises:
-        SceneNotFoundError: No frame has a photograph.
-        SceneFormatError: A record is malformed.
-    """
+    """Read the frames that have a photograph, with their depth maps; the cloud is empty."""
     root = Path(root)
     names = sorted(path.name for path in root.iterdir())
     records = {Path(name).stem: root / name for name in names if _RECORD.fullmatch(name)}

@@ -128,7 +128,6 @@ def carry_seeds(scene: Scene, written: Path, folder: Path) -> None:
 def _read_seeds(
     folder: Path, points: PointCloud
 ) -> tuple[dict[str, np.ndarray], tuple[Finding, ...]]:
-    """What ``seeds.npz`` says about the points read from a folder, or why it was ignored."""
     path = folder / SEEDS
     try:
         if not path.is_file():

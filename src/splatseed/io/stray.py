@@ -60,14 +60,7 @@ def is_stray(folder: Path) -> bool:
 
 
 def read_stray(root: StrPath) -> Scene:
-    """Read the sharpest frames, evenly spaced by motion, with their depth maps; without points.
-
-    Raises:
-        SceneNotFoundError: A file is missing.
-        SceneFormatError: A file is malformed, or the video has not a frame per pose.
-        MissingDependencyError: imageio-ffmpeg is not installed.
-        OutputError: The cache cannot be written.
-    """
+    """Read the sharpest frames, evenly spaced by motion, with their depth maps; without points."""
     root = Path(root)
     for name, holds in ((ODOMETRY, "the poses"), (VIDEO, "the photographs")):
         if not (root / name).is_file():
@@ -107,12 +100,7 @@ class _Track:
         return np.asarray(np.isfinite(self.poses).all(axis=1) & self.poses[:, 3:].any(axis=1))
 
     def frame(self, index: int, size: tuple[int, int]) -> PhoneFrame:
-        """Return the camera and pose of a frame of the video.
-
-        Raises:
-            NotFiniteError: The pose is not finite, or zero.
-            SceneFormatError: The quaternion is not of length 1.
-        """
+        """Return the camera and pose of a frame of the video."""
         where, pose = self.lines[index], self.poses[index]
         quat, center = pose[[6, 3, 4, 5]], pose[:3]
         check_pose((*quat, *center), "of a frame", where)
@@ -197,7 +185,6 @@ def _extract(video: Path, track: _Track) -> Path:
 
 
 def _first_line(video: Path, track: _Track, total: int) -> int:
-    """Return the index of the line that belongs to the first frame of the video."""
     num_poses = len(track.poses)
     if total >= num_poses:
         return 0

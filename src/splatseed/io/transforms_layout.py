@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Collection, Mapping, Sequence
@@ -18,7 +17,7 @@ from splatseed.findings import Finding
 from splatseed.io import nerfstudio
 from splatseed.io.camera_records import OPENCV_FROM_OPENGL
 from splatseed.io.colmap_layout import Written, without_zero_distortion, write_colmap_layout
-from splatseed.io.files import absolute
+from splatseed.io.files import absolute, read_json
 from splatseed.io.frame_files import Found, FrameFiles
 from splatseed.io.image_folders import (
     copy_files,
@@ -133,7 +132,6 @@ def _write(scene: Scene, folder: Path, plan: _Plan, layout: Layout) -> Written:
 
 
 def _new_json(scene: Scene, A: Float64[np.ndarray, "3 4"] | None) -> dict[str, Any]:
-    """Make the content of a new ``transforms.json``, with poses transformed by A."""
     used = {image.intrinsics.camera_id: image.intrinsics for image in scene.images}
     cameras = {camera_id: _camera_fields(camera) for camera_id, camera in used.items()}
     models = sorted({fields["camera_model"] for fields in cameras.values()})
@@ -164,7 +162,6 @@ def _new_json(scene: Scene, A: Float64[np.ndarray, "3 4"] | None) -> dict[str, A
 
 
 def _camera_fields(camera: Intrinsics) -> dict[str, Any]:
-    """Return a camera record's fields by nerfstudio's names."""
     camera = without_zero_distortion(camera)
     model = _MODELS.get(camera.model)
     if model is None:
@@ -224,7 +221,6 @@ def _kept_json(transforms: nerfstudio.Transforms, names: Collection[str]) -> dic
 
 
 def _named(transforms: nerfstudio.Transforms, key: str) -> list[str]:
-    """List the files that the frames name under a key."""
     names = (frame.fields.get(key) for frame in transforms.frames)
     return [name for name in names if isinstance(name, str)]
 
@@ -277,7 +273,7 @@ def rewrites_masks(scene: Scene, layout: Layout) -> bool:
 def forget_masks(folder: Path) -> None:
     """Name no masks in an output's ``transforms.json``, as it has none."""
     path = folder / "transforms.json"
-    content = json.loads(path.read_text("utf-8"))
+    content = read_json(path)
     _drop_mask_paths(content)
     write_json(path, content)
 
@@ -288,7 +284,6 @@ def _drop_mask_paths(content: Mapping[str, Any]) -> None:
 
 
 def _names_masks(source: SceneSource) -> bool:
-    """Whether the scene's own ``transforms.json`` names masks."""
     if source.transforms_path is None:
         return False
     frames = nerfstudio.read_transforms(source.transforms_path).frames
