@@ -268,7 +268,8 @@ def align_map(
     a small error, keeps its unit. By default, ``unit_ray`` is set for least squares only, so that
     equation 7 fits the points that equation 9 lifts.
     """
-    seen, unit_ray = points, fit == "least-squares" if unit_ray is None else unit_ray
+    seen = points
+    unit_ray = fit == "least-squares" if unit_ray is None else unit_ray
     value, z, points = _values_at(depth, camera, seen, unit_ray=unit_ray)
     if in_units and len(value) < max(min_points, 1):
         return check_units(depth, camera, seen, unit_ray=unit_ray)

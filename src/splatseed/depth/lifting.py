@@ -172,11 +172,10 @@ def _images_with_maps(
             found=f"{len(scene.images)} images, and maps of none of them",
             fix="Name the folder of the maps with `depth` (in Python: scene.with_depths).",
         )
-    if lacking := sum(image.name not in depths for image in used):
-        verbs = agreeing(lacking, "has no depth map and gives", "have no depth map and give")
-        text = f"{lacking} of {len(used)} images {verbs} no points."
-        names = tuple(image.name for image in used if image.name not in depths)
-        findings.append(Finding("missing-depth-maps", text, subjects=names))
+    if lacking := tuple(image.name for image in used if image.name not in depths):
+        verbs = agreeing(len(lacking), "has no depth map and gives", "have no depth map and give")
+        text = f"{len(lacking)} of {len(used)} images {verbs} no points."
+        findings.append(Finding("missing-depth-maps", text, subjects=lacking))
     with_photographs(scene)  # raises if too few are there
     return [image for image in images if image.has_photograph]
 
