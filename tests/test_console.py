@@ -21,8 +21,7 @@ from splatseed.console import (
     show_extraction,
     stage_display,
 )
-from splatseed.progress import extraction_progress, silent
-from splatseed.runtime import compilation
+from splatseed.progress import extraction_progress, notify, silent
 from splatseed.text import quoted, visible
 
 LONG = "/".join(["a_rather_long_folder_name"] * 9)
@@ -99,8 +98,8 @@ def test_a_log_is_told_once_of_compilation_that_takes_long(capsys, monkeypatch):
     with stage_display() as clock:
         clock("fit", 0.0)
         for _ in range(2):
-            compilation.notify(begins=True)
-            compilation.notify(begins=False)
+            notify(begins=True)
+            notify(begins=False)
     with stage_display(clock):
         clock("write", 0.0)
     out, err = capsys.readouterr()
