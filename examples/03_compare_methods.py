@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 import splatseed as ss
-from splatseed.seeding.geometry_score import measure, spacing
+from splatseed.seeding.geometry_score import mean_spacing, measure
 from splatseed.synthetic import SHAPES, Surface
 
 NUM_POINTS = 2000
@@ -23,7 +23,7 @@ NEED_PHOTOGRAPHS = ("depth", "stereo", "cover", "auto", "cloud")
 def noisy_cloud(surface: Surface, rng: np.random.Generator) -> ss.PointCloud:
     """Sample a surface with noise, as Structure-from-Motion would."""
     xyz = surface.sample(NUM_POINTS, rng)
-    xyz += NOISE * spacing(xyz) * rng.normal(size=xyz.shape)
+    xyz += NOISE * mean_spacing(xyz) * rng.normal(size=xyz.shape)
     return ss.PointCloud(xyz, np.full(xyz.shape, 128, np.uint8))
 
 
@@ -33,7 +33,7 @@ def score(surface: Surface, method: str) -> tuple[float, float]:
     cloud = noisy_cloud(surface, rng)
     seeds = ss.upsample(cloud, method, ratio=8, seed=0)
     new = seeds.xyz[len(cloud) :]
-    result = measure(new, seeds.xyz, surface, surface.sample(2000, rng), spacing(cloud.xyz))
+    result = measure(new, seeds.xyz, surface, surface.sample(2000, rng), mean_spacing(cloud.xyz))
     return result.error, result.coverage
 
 

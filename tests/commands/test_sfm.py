@@ -15,6 +15,7 @@ from splatseed.io.load import with_own_depths
 from splatseed.seeding.pose_accuracy import PoseErrorEstimate
 from splatseed.sfm import Refinement, Settings, SfmReport
 from splatseed.sfm.photos import find_photos
+from splatseed.sfm.refinement import unrefined_finding
 
 from ..io.phone_exports import write_polycam, write_scanner_app
 
@@ -34,7 +35,11 @@ def called(monkeypatch, tmp_path):
     def reconstruct(*args, **kwargs):
         calls.update(args=args, **kwargs)
         change = changes.pop() if kwargs.get("refine_poses") else None
-        return SfmReport(tmp_path / "out", 13, 20, LOST, *FACTS, change, num_pairs=77)
+        found = unrefined_finding(20, change.excluded) if change else None
+        findings = () if found is None else (found,)
+        return SfmReport(
+            tmp_path / "out", 13, 20, LOST, *FACTS, change, findings=findings, num_pairs=77
+        )
 
     monkeypatch.setattr(sfm, "reconstruct", reconstruct)
     monkeypatch.setattr(sfm, "_pose_error", lambda *_: calls.get("error"))
