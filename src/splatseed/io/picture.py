@@ -35,7 +35,7 @@ WHITE = 65535
 """White if all 16 bits are used."""
 _BITS = (8, 10, 12, 14)
 """Smaller bit depths of cameras and converters."""
-_NATIVE, _OTHER = ("L", "B") if sys.byteorder == "little" else ("B", "L")
+_OTHER = "B" if sys.byteorder == "little" else "L"  # byte order than this machine's
 _LOW_BYTES = {
     "LA;16B": "RGBA",  # both bytes of grey, then of alpha, as four channels
     **{
