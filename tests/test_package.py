@@ -360,7 +360,7 @@ def test_dependencies_are_those_that_are_imported():
         allowed = base | more if trains else base
         allowed = base | names["depth"] if path.name == "monocular.py" else allowed
         allowed = base | names["cluster"] if path.name.startswith("ray_") else allowed
-        if part in {"splat", "viewer", "commands"} or path.name == "video.py":
+        if part in {"splat", "viewer", "commands"} or path.name == "recordings.py":
             allowed = allowed | names["view"]
         if path.parent.name == "clouds":
             allowed = allowed | names["scan"]

@@ -253,10 +253,11 @@ def print_pairs(title: str, rows: Sequence[tuple[str, str]]) -> None:
         OUT.print(f"  {label:<{width}}  {visible(with_options(value))}", soft_wrap=True)
 
 
-def print_note(finding: Finding) -> None:
-    """Print a finding, with options for the library's arguments."""
-    OUT.print("note:", style="yellow", end=" ")
-    OUT.print(visible(with_options(str(finding))), soft_wrap=True)
+def print_note(*findings: Finding) -> None:
+    """Print findings, with options for the library's arguments."""
+    for finding in findings:
+        OUT.print("note:", style="yellow", end=" ")
+        OUT.print(visible(with_options(str(finding))), soft_wrap=True)
 
 
 def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

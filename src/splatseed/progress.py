@@ -21,7 +21,7 @@ Progress: TypeAlias = Callable[[str, float], None]
 Note: TypeAlias = Callable[[Finding], None]
 
 extraction_progress: ContextVar[Progress] = ContextVar("extraction_progress")
-"""Called while a video or archive is extracted (``io.extraction``); unset: shown nowhere."""
+"""Called while a video or archive is extracted (``io.recordings``); unset: shown nowhere."""
 thread_limit: ContextVar[int | None] = ContextVar("thread_limit", default=None)
 """Maximum threads of ``in_threads``; None for one per available CPU."""
 

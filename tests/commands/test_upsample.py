@@ -20,7 +20,7 @@ from PIL import Image as PilImage
 
 import splatseed as ss
 from splatseed.camera import rotation_from_quat
-from splatseed.commands.upsample.cloud import LoadedCloud
+from splatseed.commands.upsample.command import LoadedCloud
 from splatseed.findings import Finding
 from splatseed.io import load_scene, write_scene
 from splatseed.io.nerfstudio import read_cloud_transform

@@ -34,7 +34,7 @@ def room_with_depth(room) -> Scene:
 def captures(tmp_path, monkeypatch) -> Path:
     """An empty cache of extracted photographs."""
     folder = tmp_path / "captures"
-    monkeypatch.setattr("splatseed.io.extraction._base", lambda: folder)
+    monkeypatch.setattr("splatseed.io.recordings._base", lambda: folder)
     return folder
 
 

@@ -27,7 +27,7 @@ repeat = settings(
 
 
 def assert_read(path, expected):
-    values = read_stored(path).values
+    values = read_stored(path)
     np.testing.assert_array_equal(values, expected)
     assert values.shape == expected.shape
 
@@ -51,10 +51,9 @@ def test_npz(tmp_path, array, key, packed):
 
 def test_npz_says_what_it_holds(tmp_path):
     depth, path = np.ones((2, 3)), tmp_path / "a.npz"
-    np.savez(path, depth=depth, mask=np.zeros((4, 5)), kind="inverse")
+    np.savez(path, depth=depth, mask=np.zeros((4, 5)), camera="pinhole")
     assert_read(path, depth)
-    assert read_stored(path).kind == "inverse"
-    for wrong in ({"disparity": depth, "mask": depth}, {"kind": "ray"}, {"a": depth, "kind": 3}):
+    for wrong in ({"disparity": depth, "mask": depth}, {"camera": "ray"}, {"a": depth, "b": 3}):
         np.savez(path, **wrong)
         with pytest.raises(SceneFormatError, match=r"a\.npz"):
             read_stored(path)

@@ -103,4 +103,4 @@ def test_an_archive_that_would_burst_is_refused_by_its_header(tmp_path):
     constant, unread = np.zeros((48, 64), np.float32), np.zeros(1 << 22)
     np.savez_compressed(tmp_path / "more.npz", depth=constant, normals=unread)
     with little_memory(1 << 20):
-        assert read_stored(tmp_path / "more.npz").values.shape == (48, 64)
+        assert read_stored(tmp_path / "more.npz").shape == (48, 64)

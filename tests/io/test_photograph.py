@@ -10,9 +10,9 @@ from PIL import Image as PilImage
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene, write_scene
-from splatseed.io.bit_depth import find_white
 from splatseed.io.masks import read_mask
 from splatseed.io.photograph import check_photograph, decode_photograph, photograph_bytes
+from splatseed.io.picture import find_white
 from splatseed.photos.loading import load_views
 from splatseed.scene import Masks
 

@@ -29,6 +29,6 @@ def test_a_tiff_is_read_as_stored(tmp_path, orientation, compression):
     depth = (pixels[..., 0].astype(np.uint16) + 1) * 100
     for values in (depth, depth.astype(np.float32)):
         PilImage.fromarray(values).save(path, **how)
-        assert np.array_equal(read_stored(path).values, values)
+        assert np.array_equal(read_stored(path), values)
     PilImage.fromarray(depth).save(path, **how)
     assert np.abs(read_photograph(path, 25600)[..., 0] - depth * (255 / 25600)).max() < 0.51

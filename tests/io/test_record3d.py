@@ -17,7 +17,7 @@ from PIL import Image as PilImage
 
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
 from splatseed.io import find_depths, load_scene, write_scene
-from splatseed.io.film import FilmSettings
+from splatseed.io.recordings import FilmSettings
 
 from ..findings import texts
 from .phone_exports import change, check_cameras, check_depths, write_r3d, write_record3d
@@ -125,7 +125,7 @@ def test_of_a_long_recording_the_sharpest_are_used(export, monkeypatch):
     for number in (1, 4, 7):
         photograph = PilImage.open(rgb / f"{number}.jpg").reduce(4).resize((96, 72))
         photograph.save(rgb / f"{number}.jpg")
-    monkeypatch.setattr("splatseed.io.film.FILM", FilmSettings(max_photographs=8))
+    monkeypatch.setattr("splatseed.io.recordings.FILM", FilmSettings(max_photographs=8))
     scene = load(export)
     numbers = {int(Path(image.name).stem) for image in scene.images}
     assert not numbers & {1, 4, 7}
@@ -222,7 +222,7 @@ def test_nothing_half_extracted_remains(room_with_depth, tmp_path, captures, lzf
 
 
 def test_a_cache_that_cannot_be_written(room_with_depth, tmp_path, monkeypatch):
-    monkeypatch.setattr("splatseed.io.extraction._base", lambda: tmp_path / "file/captures")
+    monkeypatch.setattr("splatseed.io.recordings._base", lambda: tmp_path / "file/captures")
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="user's cache folder, which XDG_CACHE_HOME sets"):
         load(write_r3d(room_with_depth, tmp_path / "walk.r3d"))
@@ -236,7 +236,7 @@ def test_a_cache_that_cannot_be_written(room_with_depth, tmp_path, monkeypatch):
         ({"K": [9, 0, 5, 0, 9, 4, 0, 0, 1]}, "not column by column"),
         ({"K": [9, 9, 5, 4]}, "lists of 4 numbers, not 9"),
         ({"poses": [[0, 0, 0, 1, 2, 3]] * 9}, "lists of 6 numbers, not 7"),
-        ({"poses": [[1, 2, 3, 0, 0, 0, 1]] * 9}, r"length 1, then a position, in .*pose 0"),
+        ({"poses": [[1, 2, 3, 0, 0, 0, 1]] * 9}, r"qx qy qz qw of length 1 in .*pose 0"),
         ({"poses": "many"}, "found"),
         ({"poses": [[float("nan")] * 7] * 9}, "finite pose"),
         ({"w": 48, "h": 36}, "middle of 48 x 36 pixels"),

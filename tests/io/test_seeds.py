@@ -156,7 +156,6 @@ def test_a_scene_without_originals_keeps_what_its_points_are(scene, tmp_path):
     ("told", "all_of_them"),
     [
         ({"command": "upsample", "parameters": {"test_every": 0}}, True),
-        ({"command": "upsample", "parameters": {"hold_out": 0}}, True),  # as 0.3 wrote it
         ({"command": "upsample", "parameters": {"test_every": 8}}, False),
         (
             {"command": "upsample", "parameters": {"test_every": 0}, "listed_tests_held_out": True},
@@ -173,7 +172,7 @@ def test_seeds_that_saw_the_test_views_are_known(scene, tmp_path, told, all_of_t
     again, notes = load_scene(tmp_path / "out"), []
     assert saw_all_photographs(again) == all_of_them
     seeded(again, TrainSettings(seeding="scene"), "cpu", notes.append, silent)
-    assert any(note.kind == "seeds-of-test-views" for note in notes) == all_of_them
+    assert any(each.kind == "seeds-of-test-views" for each in notes) == all_of_them
     assert not saw_all_photographs(scene)
     for text in ("", "[]", '{"num_points": 1, "num_original": 1}', '{"num_points": "x"}'):
         (tmp_path / "out/splatseed.json").write_text(text)

@@ -11,7 +11,7 @@ from PIL import Image as PilImage
 
 from splatseed.errors import MissingDependencyError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
-from splatseed.io.film import FilmSettings
+from splatseed.io.recordings import FilmSettings
 from splatseed.io.stray import CAMERA, ODOMETRY, VIDEO
 
 from ..findings import texts

@@ -191,7 +191,6 @@ def _changed(plan: Plan, options: Options) -> Plan:
 
 
 def _scenes(plan: Plan, options: Options) -> list[PlannedScene]:
-    """The scenes named by ``--scenes`` (with ``--data`` those of the plan), or all of the plan."""
     if not (options.data and options.scenes):
         return [PlannedScene(path) for path in options.scenes] or list(plan.scenes)
     own = {scene.label: scene for scene in plan.scenes}
@@ -260,7 +259,6 @@ def _prepare(
 
 
 def _budget_findings(options: Options, plan: Plan) -> Iterator[Finding]:
-    """Explain the budgets and ratios where one of both options is left out."""
     if options.budgets and plan.budgets and not plan.ratios:
         text = "Methods fill the budget: --ratios 8 makes 8 times the points instead."
         yield Finding("budget", text, "info")
@@ -336,8 +334,7 @@ def _bench(options: Options, plan: Plan, machine: Machine, arguments: Sequence[s
     with atomic_file(bench / PLAN) as partial:  # escapes file names that are no text
         partial.write_text(plan_text(plan), "utf-8", "backslashreplace")
     runs = [read_run(bench, spec) for spec in specs]
-    for finding in findings:
-        print_note(finding)
+    print_note(*findings)
     names = ", ".join(f"{visible(s.name)} ({s.num_points:,} points)" for s in scenes)
     lines = [names, *_announcement(plan, runs, machine), visible(bench)]
     OUT.print("\n  -> ".join(lines), soft_wrap=True)
@@ -352,7 +349,6 @@ def _bench(options: Options, plan: Plan, machine: Machine, arguments: Sequence[s
 
 
 def _announcement(plan: Plan, runs: Sequence[BenchRun], machine: Machine) -> Iterator[str]:
-    """Describe the runs, and estimate time and disk of the pending ones."""
     yield f"{count_runs(runs)}; {machine.description}"
     specs = (run.spec for run in runs if run.spec.arm.budget)
     limits = dict.fromkeys((spec.scene.name, spec.training.cap_max) for spec in specs)
@@ -447,8 +443,7 @@ def _report(arguments: list[str]) -> None:
         report = write_report(options.bench, clock)
     for sentence in report.summary:
         OUT.print(sentence)
-    for finding in report.findings:
-        print_note(finding)
+    print_note(*report.findings)
     kinds = f"{report.tables}, each as .csv and .html, in {options.bench / 'tables'}"
     figures = f"{report.figures} in {options.bench / 'figures'}"
     rows = [("report", str(report.path)), ("tables", kinds), ("figures", figures)]

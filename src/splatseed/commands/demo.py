@@ -189,7 +189,6 @@ def _compile(part: str, scene: Scene, folder: Path) -> None:
 
 
 def _has_pytorch() -> bool:
-    """Return whether training's packages are completely installed."""
     invalidate_caches()
     # Versions come from what pip writes last.
     return all(map(version_of, ("torch", "gsplat", "torchmetrics", "flip-evaluator")))
@@ -199,7 +198,6 @@ def _has_pytorch() -> bool:
 
 
 def _make_points(options: Options) -> None:
-    """Write the capture, its points by every method, their errors, and pictures."""
     from splatseed.photos.viewpoint import choose_camera
     from splatseed.seeding.geometry_score import mean_spacing, measure
     from splatseed.synthetic import make_capture, write_capture

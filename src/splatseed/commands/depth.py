@@ -80,7 +80,6 @@ def run(arguments: list[str]) -> None:
 
 
 def _provenance(options: Options) -> dict[str, object]:
-    """Options and versions of packages, for ``splatseed.json``."""
     given = {name: value for name, value in asdict(options).items() if value is not None}
     return {"command": "depth", "options": given, "versions": versions_of(PACKAGES)}
 
@@ -111,8 +110,7 @@ def _run_network(options: Options, model: str) -> None:
         ("output", str(options.output)),
     ]
     print_pairs("splatseed depth", rows)
-    for finding in scene.findings:
-        print_note(finding)
+    print_note(*scene.findings)
     if report.flat:
         flat = name_some(report.flat, NAMES_SHOWN)
         text = f"the network predicted no depth (a constant map, or none) for: {flat}"
@@ -161,8 +159,7 @@ def _summarise_stereo(
         f"pixels confirmed by other views, in {seconds:.1f} s, written to {visible(path)}",
         soft_wrap=True,
     )
-    for finding in without_kinds(scene.findings, "lens-distortion"):
-        print_note(finding)
+    print_note(*without_kinds(scene.findings, "lens-distortion"))
     if report.empty:
         text = f"no other view confirms any pixel of: {name_some(report.empty, NAMES_SHOWN)}"
         print_note(Finding("no-depth", text, subjects=tuple(report.empty)))

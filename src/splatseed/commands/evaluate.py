@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from splatseed.commands.options import parse_options
-from splatseed.commands.outputs import check_free
+from splatseed.commands.options import check_free, parse_options
 from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
 from splatseed.findings import Finding
 from splatseed.io.staging import check_output, output_folder, write_json
@@ -100,14 +99,12 @@ def run(arguments: list[str]) -> None:
     if result.lpips is None:
         text = f"LPIPS was not computed: {result.lpips_reason}"
         print_note(Finding("missing-lpips", text, "info"))
-    for finding in evaluation.findings(model):
-        print_note(finding)
+    print_note(*evaluation.findings(model))
 
 
 def _score(
     options: Options, evaluation: Evaluation, model: TrainedModel, clock: StageClock
 ) -> EvalResult:
-    """Score the test views and write the requested files."""
     from splatseed.splat.pictures import picture_names, write_comparison
 
     score = partial(evaluation.score, model, progress=clock)

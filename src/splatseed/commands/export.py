@@ -9,8 +9,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from splatseed.commands.options import parse_options, refuse
-from splatseed.commands.outputs import check_free
+from splatseed.commands.options import check_free, parse_options, refuse
 from splatseed.console import print_note, print_pairs, stage_display
 from splatseed.findings import Finding
 from splatseed.io.origin import RECENTER, choose_origin, format_offset, offset_beside, write_offset
@@ -120,8 +119,7 @@ def run(arguments: list[str]) -> None:
     if name == "splat" and gaussians.shN.size:
         text = "A .splat has no view-dependent colour: the model's is left out."
         findings.append(Finding("unused-harmonics", text))
-    for finding in findings:
-        print_note(finding)
+    print_note(*findings)
     if page:
         link = visible(target.resolve().as_uri())
         print_pairs("next", [("open it in a browser, here or wherever you send it", link)])
@@ -131,7 +129,6 @@ def run(arguments: list[str]) -> None:
 
 
 def _write_file(path: Path, kept: Gaussians, target: Path, progress: Progress, note: Note) -> None:
-    """Write the Gaussians, read from ``path``, and their offset."""
     offset, far = offset_beside(path), choose_origin(kept.means)
     kept = translate_gaussians(kept, -far) if far.any() else kept
     offset = far if offset is None else offset + far

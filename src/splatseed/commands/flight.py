@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 
-from splatseed.commands.options import parse_options, refuse
-from splatseed.commands.outputs import check_free
+from splatseed.commands.options import check_free, parse_options, refuse
 from splatseed.console import print_note, print_pairs, stage_display
 from splatseed.errors import ParameterError
 from splatseed.findings import Finding
@@ -110,8 +109,7 @@ def run(arguments: list[str]) -> None:
         ("video", f"{options.output}, {options.output.stat().st_size / 1e6:.1f} MB"),
     ]
     print_pairs("splatseed flight", rows)
-    for finding in (finding for item in items for finding in item.findings):
-        print_note(finding)
+    print_note(*(finding for item in items for finding in item.findings))
     if items[0].moved and options.path not in (None, ORBIT) and options.transform is None:
         text = f"The path {options.path} is taken to be in the model's frame, too, and was "
         text += "transformed with it; for one in the scene's frame, pass --transform none."
@@ -122,7 +120,6 @@ def run(arguments: list[str]) -> None:
 
 
 def _open_models(options: Options) -> list[ViewerItem]:
-    """Read the model, and the model to compare it with, of the same scene."""
     from splatseed.viewer.models import open_item, same_world, unique_names
 
     paths = [path for path in (options.model, options.compare) if path is not None]
@@ -142,7 +139,6 @@ def _open_models(options: Options) -> list[ViewerItem]:
 
 
 def _size(options: Options, item: ViewerItem) -> tuple[int, int]:
-    """Width and height of the video."""
     from splatseed.viewer.flights import even_size, size_of_path
 
     if options.size is not None:
@@ -164,7 +160,6 @@ def _size(options: Options, item: ViewerItem) -> tuple[int, int]:
 
 
 def _path(options: Options, item: ViewerItem, size: tuple[int, int]) -> tuple[list[View], float]:
-    """A camera per frame, and the frame rate."""
     from splatseed.splat.model_frame import NO_TRANSFORM, find_transform
     from splatseed.viewer import flights
 

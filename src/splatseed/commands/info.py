@@ -20,8 +20,7 @@ import tyro
 from splatseed.camera import Intrinsics
 from splatseed.commands import next_steps
 from splatseed.commands.next_steps import Commands, Planned, TrainerName
-from splatseed.commands.options import parse_options, refuse
-from splatseed.commands.outputs import check_free
+from splatseed.commands.options import check_free, parse_options, refuse
 from splatseed.console import (
     OUT,
     StageClock,

@@ -69,8 +69,7 @@ def show_model(path: Path, *, as_json: bool = False) -> None:
     if offset is not None:
         rows.append(("offset", f"{format_offset(offset)}: before = after + offset"))
     print_pairs(str(path), rows)
-    for finding in findings:
-        print_note(finding)
+    print_note(*findings)
     known = isinstance(config_of(path).get("scene"), str)
     scored = f"splatseed evaluate {quoted(path)}{'' if known else ' --scene SCENE'}"
     print_pairs("next", [("look at it", f"splatseed view {quoted(path)}"), ("score it", scored)])

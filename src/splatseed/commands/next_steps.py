@@ -149,7 +149,6 @@ def advice_commands(
 
 
 def _seeding(path: Path, advice: Advice, planned: Planned, *, refine: bool) -> str:
-    """Return the command that adds points by the method advised."""
     how = f"--method {advice.method} --ratio 4"
     if advice.method == "auto":  # as train seeds: more gain nothing in a whole run
         fits = planned.most_seeds <= planned.max_seeds
@@ -174,7 +173,6 @@ def _most_seeds(images: Sequence[Image]) -> int:
 def _for_trainer(
     path: Path, scene: Scene, advice: Advice, planned: Planned, *, refine: bool
 ) -> Commands:
-    """Return the commands that lead to another trainer."""
     source = scene.source.format
     layout: Layout = "transforms" if source == "transforms" else "colmap"
     if read_manifest(scene.source.root).get("format") == "both":

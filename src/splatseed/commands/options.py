@@ -1,14 +1,19 @@
-"""Parse a verb's options with tyro, which prints help, errors (exit code 2) and completions."""
+"""Parse a verb's options with tyro, which prints help, errors (exit code 2) and completions.
+
+What they name to write is checked before any work is done.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, TypeVar
 
 import tyro
 
-from splatseed.errors import ParameterError
+from splatseed.errors import OutputError, ParameterError
+from splatseed.io.staging import check_parents, check_separate
 
 Options = TypeVar("Options")
 
@@ -65,3 +70,23 @@ def check_minimum(options: object, minimum: float, *names: str) -> None:
         wrong = value is not None and not value >= minimum
         expected = f"{option} of {minimum:g} or more"
         refuse((wrong, expected, value, "Leave it out for the default."))
+
+
+def check_free(
+    path: Path,
+    *,
+    overwrite: bool = False,
+    protect: Sequence[Path] = (),
+    fix: str = "Pass --overwrite to replace it, or choose another name.",
+) -> None:
+    """Refuse an output file that may not be written, before any work is done.
+
+    It must neither equal nor lie in the inputs ``protect``; ``fix`` is for a file that exists.
+    """
+    check_separate(path, protect)
+    check_parents(path)
+    if path.exists() and not path.is_file():
+        found = "a folder" if path.is_dir() else "no regular file"
+        raise OutputError(f"a file name at {path}", found=found, fix="Choose another name.")
+    if path.exists() and not overwrite:
+        raise OutputError(f"no file at {path}", found="one", fix=fix)

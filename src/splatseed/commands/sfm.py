@@ -134,15 +134,13 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
     else:
         stages = [*(["refinement"] if options.refine_poses else []), "triangulation"]
         poses = load_scene(options.poses_from, require_points=False)
-        for finding in (each for each in poses.findings if each.kind == "far-from-origin"):
-            print_note(finding)
+        print_note(*(each for each in poses.findings if each.kind == "far-from-origin"))
         how = {"poses_from": poses, "refine_poses": options.refine_poses}
     if poses is not None and poses.masks is not None and poses.masks.files:
         masks = poses.masks
     elif not video:
         masks, findings = masks_near(images)
-        for finding in findings:
-            print_note(finding)
+        print_note(*findings)
     return reconstruct(
         images,
         options.output,
@@ -261,8 +259,7 @@ def _summarise(options: Options, report: SfmReport, error: PoseErrorEstimate | N
             "more photographs, closer together, of where they are wrong."
         )
         print_note(Finding("inexact-poses", text))
-    for finding in report.findings:
-        print_note(finding)
+    print_note(*report.findings)
     if report.unregistered:
         text = f"without a pose: {name_some(report.unregistered)}"
         print_note(Finding("unregistered-images", text, subjects=tuple(report.unregistered)))

@@ -92,14 +92,12 @@ def parse(arguments: list[str]) -> Options:
 
 
 def _words(arguments: Sequence[str]) -> set[str]:
-    """Return the fields of the options on the command line."""
     options = {each.partition("=")[0] for each in arguments if each.startswith("--")}
     names = {option.removeprefix("--").replace("-", "_") for option in options}
     return {"seeding" if name == "seeds" else name for name in names}
 
 
 def _with_options(path: Path, content: Mapping[str, Any]) -> Options:
-    """Return the options of a file, checked."""
     kinds = (TrainSettings, TrainRequest, Options)
     hints = {kind: get_type_hints(kind) for kind in kinds}
     known = {name: kind for kind in kinds for name in hints[kind] if name not in NESTED}
@@ -169,8 +167,7 @@ def run(arguments: list[str]) -> None:
         training = prepare_training(
             options.scene, options.output, options.request, note=findings.append, progress=clock
         )
-    for finding in findings:
-        print_note(finding)
+    print_note(*findings)
     _announce(options, training)
     left = _TimeLeft(training, per_pixel=_per_pixel(options))
     with _watched(options, training) as viewer, _training_bar(training, left) as show:
@@ -261,9 +258,8 @@ class _TimeLeft:
         self.seconds = seconds_left(training.settings, now)
         if not self._is_printed and elapsed > REPORT_AFTER:
             self._is_printed = True
-            for finding in self._findings(now, self.seconds):
-                print_note(finding)
-                OUT.file.flush()
+            print_note(*self._findings(now, self.seconds))
+            OUT.file.flush()
 
     @property
     def text(self) -> str:

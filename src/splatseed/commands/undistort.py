@@ -46,8 +46,7 @@ def run(arguments: list[str]) -> None:
         report = undistort(scene, output, overwrite=overwrite, on_progress=clock)
     counts = [("images", f"{report.registered:,}"), ("points", f"{report.num_points:,}")]
     print_pairs("splatseed undistort", [*counts, ("output", str(output))])
-    for finding in without_kinds(scene.findings, "lens-distortion"):
-        print_note(finding)
+    print_note(*without_kinds(scene.findings, "lens-distortion"))
     maps = scene.depths or depths_beside(scene)
     if isinstance(maps, DepthFiles) and maps:
         folder = quoted(os.path.commonpath([path.parent for path in maps.paths.values()]))

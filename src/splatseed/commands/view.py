@@ -106,7 +106,6 @@ def _items_in(path: Path) -> list[Path]:
 
 
 def _is_item(path: Path) -> bool:
-    """Whether a child of a folder is a finished run, a scene or a model."""
     if path.is_file():
         return path.name.lower().endswith(tuple(SUFFIXES))
     folder = RunFolder(path)
@@ -126,8 +125,7 @@ def _announce(options: Options, port: int, items: list[ViewerItem], second: int 
     if second is not None:
         rows.append(("side by side", f"{items[0].name} left, {items[second].name} right"))
     print_pairs("splatseed view", rows)
-    for finding in (finding for item in items for finding in item.findings):
-        print_note(finding)
+    print_note(*(finding for item in items for finding in item.findings))
     commands = [("open in a browser", f"http://{host}:{port}")]
     if options.host in LOCAL:
         tunnel = f"ssh -L {port}:localhost:{port} {socket.gethostname()}"

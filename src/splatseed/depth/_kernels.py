@@ -90,7 +90,6 @@ def draw_pixels(values, cumulative, columns, step, box, picks, jitter, radius, t
 
 @inline
 def _contains(numbers, number):
-    """Whether a short list contains a number."""
     for element in numbers:  # noqa: SIM110  (Numba has no any() of a generator)
         if element == number:
             return True
@@ -368,7 +367,6 @@ def _rgb_pixel(column, row, rgb_from_grid, shape):
 
 @inline
 def _color_error(first, second):
-    """Sum of the channels' absolute differences."""
     total = np.int64(0)
     for channel in range(3):
         total += abs(np.int64(first[channel]) - np.int64(second[channel]))

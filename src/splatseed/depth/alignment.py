@@ -130,11 +130,7 @@ def _weighted_line(value: Values, target: Values, weight: Values) -> tuple[float
 
 
 def map_camera(depth: DepthMap, image: Image) -> Camera:
-    """Scale the camera of an image to the pixels of its map.
-
-    Raises:
-        SceneFormatError: The map and the image differ in aspect ratio.
-    """
+    """Scale the camera of an image to the pixels of its map."""
     try:
         return depth.camera(image.camera)
     except SceneFormatError as error:
@@ -249,10 +245,8 @@ def align_maps(
             depth = depths.read(image.name).reliable(DepthSettings.min_confidence)
             camera = map_camera(depth, image)
             points = points_in_image(camera, visibility.of(image))
-            alignment = align_map(depth, camera, points)
-            if alignment.num_points < DepthSettings.min_points and in_scene_units(depths):
-                alignment = check_units(depth, camera, points)
-            found[image.name] = alignment
+            in_units = in_scene_units(depths)
+            found[image.name] = align_map(depth, camera, points, in_units=in_units)
 
     in_threads(work, len(images), 1, "align depth", progress)
     return reject_outliers({image.name: found[image.name] for image in images}, max_residual_ratio)
@@ -265,16 +259,20 @@ def align_map(
     fit: Fit = DepthSettings.fit,
     min_points: int = DepthSettings.min_points,
     *,
+    in_units: bool = False,
     unit_ray: bool | None = None,
 ) -> Alignment:
     """Align one map to the SfM points that its image sees.
 
-    ``camera`` is in pixels of the map. By default, ``unit_ray`` is set for least squares only, so
-    that equation 7 fits the points that equation 9 lifts.
+    ``camera`` is in pixels of the map. With too few points, a map ``in_units`` of the scene, up to
+    a small error, keeps its unit. By default, ``unit_ray`` is set for least squares only, so that
+    equation 7 fits the points that equation 9 lifts.
     """
-    if unit_ray is None:
-        unit_ray = fit == "least-squares"
-    value, z, points = _values_at(depth, camera, points, unit_ray=unit_ray)
+    seen = points
+    unit_ray = fit == "least-squares" if unit_ray is None else unit_ray
+    value, z, points = _values_at(depth, camera, seen, unit_ray=unit_ray)
+    if in_units and len(value) < max(min_points, 1):
+        return check_units(depth, camera, seen, unit_ray=unit_ray)
     known = depth.values[np.isfinite(depth.values)]
     rejected = None
     if not known.size:

@@ -27,6 +27,7 @@ from splatseed.depth.views import DepthView, read_view
 from splatseed.depthmap import in_scene_units
 from splatseed.errors import PointCloudError, SceneFormatError, SceneNotFoundError
 from splatseed.findings import Finding
+from splatseed.io.origin import translated_image
 from splatseed.io.photograph_checks import with_photographs
 from splatseed.photos.sizes import default_factor
 from splatseed.photos.visibility import Visibility, find_visibility
@@ -144,11 +145,7 @@ def suggested_number(scene: Scene, settings: DepthSettings) -> int:
 
 
 def _settings_without_points(scene: Scene, settings: DepthSettings) -> DepthSettings:
-    """Return the settings, without alignment if there are no points to align to.
-
-    Raises:
-        PointCloudError: There are none, and the maps' unit is not the scene's.
-    """
+    """Return the settings, without alignment if there are no points to align to."""
     if not settings.align or scene.points.originals.finite.any():
         return settings
     if not in_scene_units(scene.depths):
@@ -164,11 +161,7 @@ def _settings_without_points(scene: Scene, settings: DepthSettings) -> DepthSett
 def _images_with_maps(
     scene: Scene, settings: DepthSettings, findings: list[Finding]
 ) -> list[Image]:
-    """Images with a depth map and a photograph, without test images; reports the others.
-
-    Raises:
-        SceneNotFoundError: There are none.
-    """
+    """Images with a depth map and a photograph, without test images; reports the others."""
     depths, used = scene.depths, scene.images
     if settings.test_every or scene.listed:
         used = scene.split(settings.test_every)[0]
@@ -179,11 +172,10 @@ def _images_with_maps(
             found=f"{len(scene.images)} images, and maps of none of them",
             fix="Name the folder of the maps with `depth` (in Python: scene.with_depths).",
         )
-    if lacking := sum(image.name not in depths for image in used):
-        verbs = agreeing(lacking, "has no depth map and gives", "have no depth map and give")
-        text = f"{lacking} of {len(used)} images {verbs} no points."
-        names = tuple(image.name for image in used if image.name not in depths)
-        findings.append(Finding("missing-depth-maps", text, subjects=names))
+    if lacking := tuple(image.name for image in used if image.name not in depths):
+        verbs = agreeing(len(lacking), "has no depth map and gives", "have no depth map and give")
+        text = f"{len(lacking)} of {len(used)} images {verbs} no points."
+        findings.append(Finding("missing-depth-maps", text, subjects=lacking))
     with_photographs(scene)  # raises if too few are there
     return [image for image in images if image.has_photograph]
 
@@ -197,7 +189,6 @@ def _read_views(
     rng: np.random.Generator,
     progress: Progress,
 ) -> list[DepthView]:
-    """Read all images, which share ``num`` candidates equally."""
     depths = scene.depths
     assert depths is not None  # noqa: S101  (these images have maps)
     views: dict[int, DepthView] = {}
@@ -223,10 +214,7 @@ def _centered(scene: Scene) -> tuple[Scene, Float64[np.ndarray, " 3"]]:
     if not scene.images:
         return scene, np.zeros(3)
     center = np.mean([image.camera.center for image in scene.images], axis=0)
-    images = tuple(
-        replace(image, translation=image.translation + image.camera.cam_from_world[:3, :3] @ center)
-        for image in scene.images
-    )
+    images = tuple(translated_image(image, center) for image in scene.images)
     points = scene.points.replace(xyz=(scene.points.xyz - center).astype(np.float32))
     return scene.replace(points=points, images=images, tracks=scene.tracks), center
 

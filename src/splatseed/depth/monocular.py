@@ -141,7 +141,6 @@ def estimate_depths(
 def _check_photographs(
     scene: Scene, max_size: int, progress: Progress
 ) -> dict[str, tuple[int, int]]:
-    """Decode each photograph, and return the size at which the network sees it, by name."""
     names, sizes = sorted(image.name for image in scene.images), {}
     check_sizes(scene.images)
     for name in names:
@@ -205,7 +204,6 @@ def _meaning_of(config: Mapping[str, Any], name: str, given: DepthKind | None) -
 
 
 def _read_config(model: str) -> Any:
-    """Configuration of a depth network, from its folder or from Hugging Face's cache."""
     try:
         config = transformers.AutoConfig.from_pretrained(model, **LOCAL)
     except Exception as error:  # transformers raises errors of many libraries

@@ -107,7 +107,6 @@ class Cubes:
         return taken
 
     def _keys(self, side: float) -> list[UInt64[np.ndarray, " C"]]:
-        """Keys of the candidates' cubes, and of the originals'."""
         low = self.xyz.min(axis=0).astype(np.float64)
         keys = [np.empty(len(points), np.uint64) for points in (self.xyz, self.originals)]
         cube_keys(self.xyz, low, side, keys[0])

@@ -76,7 +76,6 @@ class DepthView:
     reduced: Reduced | None  # None where views are not compared
 
     def __len__(self) -> int:
-        """The number of candidates."""
         return len(self.pixel)
 
     def samples(self, num: int, factor: float = 1.0) -> Float32[np.ndarray, "num 3"]:
@@ -95,12 +94,7 @@ def read_view(
     num: int,
     rng: np.random.Generator,
 ) -> DepthView:
-    """Read an image and its map, and draw about ``num`` candidates.
-
-    Raises:
-        SceneNotFoundError: A file is gone.
-        SceneFormatError: A file is damaged, does not fit, or the camera has lens distortion.
-    """
+    """Read an image and its map, and draw about ``num`` candidates."""
     refuse_distortion(image, reason="along whose rays pixels are lifted")
     depth = depths.read(image.name).reliable(settings.min_confidence)
     if (mask := image.read_mask()) is not None:
@@ -110,10 +104,10 @@ def read_view(
     points = points_in_image(camera, visibility.of(image))
     ray = {"unit_ray": settings.unit_ray}
     if settings.align:
-        alignment = align_map(depth, camera, points, settings.fit, settings.min_points, **ray)
-        few = alignment.num_points < max(settings.min_points, 1)
-        if few and in_scene_units(depths):  # their unit is the scene's, up to a small error
-            alignment = check_units(depth, camera, points, **ray)
+        alignment = align_map(
+            depth, camera, points, settings.fit, settings.min_points,
+            in_units=in_scene_units(depths), **ray,
+        )  # fmt: skip
     else:
         alignment = check_units(depth, camera, points, **ray)
     if alignment.rejected is not None:

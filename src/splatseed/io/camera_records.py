@@ -16,13 +16,16 @@ from splatseed.camera import CAMERA_MODELS, Intrinsics, quat_from_rotation, rota
 from splatseed.errors import SceneFormatError
 from splatseed.findings import Finding
 from splatseed.io.files import COPY_AGAIN
-from splatseed.text import agreeing, name_some
+from splatseed.text import agreeing, counted, name_some
 
 MAX_ID = 2**32 - 1
 """The largest camera id, image id or feature index: 32 bits in COLMAP's binary form."""
+OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Converts camera axes between OpenGL and OpenCV."""
 _MAX_SIZE = 2**31 - 1
 _RIGID_TOLERANCE = 1e-3  # of rotation @ rotation.T against the identity
 _EXACT = 1e-12  # of the same, of a rotation in double precision
+_NORM_SLACK = 0.01  # of the length of a quaternion with four digits
 _NORM_RANGE = (1e-100, 1e100)  # inside it the square of a quaternion's norm is a normal float
 
 
@@ -60,6 +63,13 @@ def check_pose(pose: Sequence[float], of: str, where: str) -> None:
     _require_finite(all(map(math.isfinite, pose)), f"a finite pose {of}", where, tuple(pose))
     is_rotation = _NORM_RANGE[0] < math.hypot(*pose[:4]) < _NORM_RANGE[1]
     _require_finite(is_rotation, f"a rotation quaternion {of}", where, tuple(pose[:4]))
+
+
+def check_unit_quat(quat: Float64[np.ndarray, " 4"], where: str, fix: str) -> None:
+    """Raise a ``SceneFormatError`` unless a wxyz quaternion has length 1, but for rounding."""
+    if abs(np.linalg.norm(quat) - 1) > _NORM_SLACK:
+        found = " ".join(f"{each:g}" for each in quat[[1, 2, 3, 0]])
+        raise SceneFormatError(f"qx qy qz qw of length 1 in {where}", found=found, fix=fix)
 
 
 def rigid_pose(
@@ -104,6 +114,15 @@ def unusable_findings(unusable: Mapping[str, NotFiniteError], used: int) -> list
     why = f"{whose} pose or camera is not finite, or zero"
     text = f"{which} ({name_some([*unusable], 3)}): {why}."
     return [Finding("unusable-images", text, subjects=tuple(unusable))]
+
+
+def left_out(kind: str, noun: str, lacking: str, names: Sequence[str]) -> list[Finding]:
+    """Report the things of these names that are left out for lack of something, if any."""
+    if not names:
+        return []
+    subject = f"{counted(len(names), noun)} without {lacking}"
+    text = f"{subject} {agreeing(len(names), 'is', 'are')} left out, such as {names[0]}."
+    return [Finding(kind, text, subjects=tuple(names))]
 
 
 def check_record(holds: bool, expected: str, where: str, found: object) -> None:

@@ -17,6 +17,7 @@ from splatseed.findings import Finding
 from splatseed.io.colmap import check_tracks
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import NO_POINT, Image, LeftOut, Observations, Scene, Tracks
+from splatseed.text import agreeing, counted
 
 _FAR_OUT = 1e4
 """Interquartile extents from which points are outliers; skies are at some hundred."""
@@ -36,13 +37,14 @@ def clean_scene(scene: Scene) -> Scene:
     non_finite, duplicates = len(points) - num_finite, num_finite - int(np.count_nonzero(keep))
     findings = []
     if non_finite:
-        what, were = ("point is", "was") if non_finite == 1 else ("points are", "were")
         which = "beyond 1e15" if np.isfinite(points.xyz).all() else "not finite"
-        text = f"{non_finite:,} {what} {which} and {were} left out."
+        are = agreeing(non_finite, f"is {which} and was", f"are {which} and were")
+        text = f"{counted(non_finite, 'point')} {are} left out."
         findings.append(Finding("non-finite-points", text))
     if duplicates:
-        what, were = ("point repeats", "was") if duplicates == 1 else ("points repeat", "were")
-        text = f"{duplicates:,} {what} the position of another and {were} left out."
+        those = counted(duplicates, "point")
+        repeat, were = ("repeats", "was") if duplicates == 1 else ("repeat", "were")
+        text = f"{those} {repeat} the position of another and {were} left out."
         findings.append(Finding("duplicate-points", text))
     return replace(
         without_points(scene, keep),
@@ -123,7 +125,6 @@ def _slots(images: Sequence[Image], tracks: Tracks) -> Int64[np.ndarray, " T"]:
 def _with_point_ids(
     images: Sequence[Image], point_ids: Int64[np.ndarray, " S"]
 ) -> tuple[Image, ...]:
-    """Set the point ids of all slots."""
     pieces = np.split(point_ids, np.cumsum(_feature_counts(images))[:-1])
     # zip is not strict: without images, np.split returns one empty piece.
     return tuple(
@@ -143,11 +144,12 @@ def outlier_findings(points: PointCloud) -> tuple[Finding, ...]:
     distance = np.abs(xyz - middle).max(axis=1)
     far = distance > _FAR_OUT * float((high - low).max())
     if far.any() and far.mean() <= _FEW and (high > low).any():
-        what, them = ("point lies", "it") if far.sum() == 1 else ("points lie", "them")
+        number = int(far.sum())
+        lie, them = agreeing(number, "lies", "lie"), agreeing(number, "it", "them")
         text = (
-            f"{far.sum():,} {what} up to {distance.max():.3g} from the middle of the others, more"
-            f" than {_FAR_OUT:,.0f} times their extent: probably a reconstruction error; remove"
-            f" {them}."
+            f"{counted(number, 'point')} {lie} up to {distance.max():.3g} from the middle of the"
+            f" others, more than {_FAR_OUT:,.0f} times their extent: probably a reconstruction"
+            f" error; remove {them}."
         )
         return (Finding("outlying-points", text),)
     return ()

@@ -114,11 +114,7 @@ class CloudFile(ABC):
         return "rgb" if self._rgb else "intensity" if self._intensity else "none"
 
     def chunks(self, size: int = CHUNK) -> Iterator[CloudChunk]:
-        """Yield the points in file order, at most ``size`` at a time; no chunk is empty.
-
-        Raises:
-            SceneFormatError: The file is truncated, or a row is malformed.
-        """
+        """Yield the points in file order, at most ``size`` at a time; no chunk is empty."""
         if self.colors != "none" and self._range is None:
             self._range = self._range_of(self._sample())
         for block in self._blocks(size):
@@ -162,7 +158,6 @@ class CloudFile(ABC):
 
 
 def _columns(block: Block, names: Sequence[str]) -> np.ndarray:
-    """Stack the columns of colours."""
     if names == (PACKED_RGB,):
         return np.ascontiguousarray(block[PACKED_RGB]).view(np.uint8).reshape(-1, 4)[:, 2::-1]
     return np.stack([np.asarray(block[name]) for name in names], axis=1)
@@ -321,7 +316,6 @@ class LineCloud(CloudFile):
         return False
 
     def _lines(self) -> Iterator[list[str]]:
-        """Yield lists of data lines."""
         rest = b""
         with open_file(self.path) as file:
             file.seek(self._offset)

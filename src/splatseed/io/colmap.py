@@ -28,7 +28,7 @@ from splatseed.io.camera_records import (
     format_error,
     make_intrinsics,
 )
-from splatseed.io.files import ByteReader, StrPath, numbered_lines
+from splatseed.io.files import ByteReader, StrPath, is_data, numbered_lines
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import NO_POINT, Image, Observations, Tracks
 
@@ -292,7 +292,6 @@ def write_points3d(path: StrPath, points: PointCloud, tracks: Tracks | None) -> 
 
 
 def _joined_records(heads: np.ndarray, tracks: Tracks) -> UInt8[np.ndarray, " B"]:
-    """Build the records of points with tracks."""
     observations = np.empty(len(tracks.image_ids), _OBSERVATION)
     observations["image_id"], observations["point2d_idx"] = tracks.image_ids, tracks.point2d_idx
     starts = tracks.offsets * _PAIR_BYTES + np.arange(len(heads) + 1) * _HEAD_BYTES
@@ -329,7 +328,7 @@ def _text_images(path: Path) -> Iterator[tuple[Any, ...]]:
     """Yield images as ``_binary_images`` does; each has a second line with its features."""
     lines = numbered_lines(path)
     for where, line in lines:
-        if not _is_data(line):
+        if not is_data(line):
             continue
         row = line.strip().split(maxsplit=9)  # a name may hold spaces
         with _parsed(where, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", row):
@@ -387,9 +386,4 @@ def _parsed(where: str, layout: str, row: Sequence[str]) -> Iterator[None]:
 
 
 def _data_lines(path: Path) -> Iterator[tuple[str, str]]:
-    return (each for each in numbered_lines(path) if _is_data(each[1]))
-
-
-def _is_data(line: str) -> bool:
-    stripped = line.lstrip()
-    return bool(stripped) and not stripped.startswith("#")
+    return (each for each in numbered_lines(path) if is_data(each[1]))

@@ -16,11 +16,11 @@ from splatseed.findings import Finding
 from splatseed.io import colmap
 from splatseed.io.cleaning import renumber
 from splatseed.io.colmap_model import read_model_cameras
+from splatseed.io.depth_maps import LENSES
 from splatseed.io.image_folders import copy_files, image_folders
 from splatseed.io.ply import write_ply
 from splatseed.io.seeds import write_seeds
 from splatseed.io.split import MODEL_LISTS, ROOT_LISTS
-from splatseed.io.undistorted import LENSES
 from splatseed.scene import Scene
 
 Written = tuple[list[Finding], dict[str, Path], Float64[np.ndarray, " 3"]]

@@ -19,7 +19,7 @@ from splatseed.errors import SceneNotFoundError, SplatseedError
 from splatseed.findings import Finding
 from splatseed.io.camera_records import Unusable, check_enough, unusable_findings, unusable_images
 from splatseed.io.colmap import MIN_IMAGE_BYTES, read_cameras, read_images, read_points3d
-from splatseed.io.files import StrPath, numbered_lines, open_file
+from splatseed.io.files import StrPath, is_data, numbered_lines, open_file
 from splatseed.io.origin import recentered
 from splatseed.io.photograph import lens_findings
 from splatseed.io.photograph_checks import photograph_findings
@@ -43,7 +43,12 @@ def scene_model(root: Path) -> Path | None:
 
 def nested_model(root: Path) -> Path | None:
     """Find the model in ``colmap/sparse``, nerfstudio's place for it."""
-    return largest_model(root / "colmap/sparse") or find_model(root / "colmap/sparse")
+    return next(iter(models_in(root / "colmap/sparse")), None)
+
+
+def models_in(folder: Path) -> list[Path]:
+    """Return the models in a folder of numbered ones, most images first, or the folder itself."""
+    return ranked_models(folder) or [each for each in (folder,) if find_model(each)]
 
 
 def largest_model(folder: Path) -> Path | None:
@@ -85,7 +90,7 @@ def _count_lines(path: Path) -> int:
     """Count the images of ``images.txt``: two lines each, of which the second may be blank."""
     count, lines = 0, numbered_lines(path)
     for _, line in lines:
-        if line.strip() and not line.lstrip().startswith("#"):
+        if is_data(line):
             count += 1
             next(lines, None)
     return count
@@ -201,8 +206,7 @@ def read_model_cameras(
 ) -> tuple[tuple[Intrinsics, ...], tuple[Image, ...], Unusable]:
     """Read the usable camera and image records of a model, and the errors of the others.
 
-    Raises:
-        NotFiniteError: Fewer than half of the images are usable.
+    Raises ``NotFiniteError`` if fewer than half of the images are usable.
     """
     cameras_path, images_path = model_file(model_dir, "cameras"), model_file(model_dir, "images")
     if cameras_path is None and images_path is not None:

@@ -187,11 +187,8 @@ def write_dense_workspace(  # noqa: D417  (the rest is as for maps)
 def check_dense_scene(scene: Scene, *, undistorts: bool = False) -> dict[str, Size]:
     """Check that a scene can become a workspace; return the sizes of its photographs by name.
 
-    Raises:
-        SceneNotFoundError: No photographs, or one is missing.
-        SceneFormatError: A camera has distortion and ``undistorts`` is False, or a photograph has
-            another aspect ratio than its camera.
-        OutputError: An image name leads out of the folder.
+    Raises an ``InputError`` if a photograph is missing or does not fit, a camera has distortion
+    without ``undistorts``, or an image name leads out of the folder.
     """
     photograph.photograph_folder(scene)  # raises if there is none
     return {image.name: _size_of(image, undistorts=undistorts) for image in scene.images}
@@ -225,7 +222,6 @@ def _write_each(
     path: Path,
     progress: Progress,
 ) -> DenseReport:
-    """Check and write maps one by one."""
     report, total = DenseReport(path), length_hint(maps, len(images)) or 1
     seen = set[str]()
     for dense in maps:
@@ -247,7 +243,6 @@ def _write_each(
 
 
 def _check_map(dense: DenseMap, images: Mapping[str, Image]) -> None:
-    """Raise ``ParameterError`` unless a map fits an image of the scene."""
     unknown = [name for name in (dense.name, *dense.sources) if name not in images]
     size = (dense.camera.height, dense.camera.width)
     arrays = (dense.depth, dense.normal[..., 0], dense.confidence, dense.agreeing)
@@ -301,7 +296,6 @@ def _toward_plane(
 
 
 def _write_stereo(folder: Path, camera: Camera, dense: DenseMap, sources: Sequence[int]) -> None:
-    """Write a map into the folder ``stereo``."""
     height, width = dense.depth.shape
     K = scaled_K(camera, width, height)  # as COLMAP scales it
     depth = depth_along(dense, K, 0.0)

@@ -14,7 +14,7 @@ import re
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, get_args
 
 import numpy as np
 from jaxtyping import UInt8
@@ -43,36 +43,25 @@ _EXR_CHANNELS = ("Z", "depth", "Depth", "D", "Y", "V", "R")
 """Channels in which renderers store depth, in order of preference."""
 
 
-class StoredDepth(NamedTuple):
-    """Stored values [H, W], and their kind if the file declares one."""
-
-    values: np.ndarray
-    kind: DepthKind | None = None
-
-
-def read_stored(path: StrPath) -> StoredDepth:
+def read_stored(path: StrPath) -> np.ndarray:
     """Read a depth map; the suffix, one of ``SUFFIXES``, determines the format.
 
     ``.npy``: an array [H, W], or with an axis of length 1 before or after. ``.npz``: the array
-    ``depth``, else ``arr_0``, else the only one; a text ``kind`` in it ("z", "ray" or "inverse")
-    declares their meaning. ``.pfm``: one channel (Debevec's format; rows are kept bottom first;
-    the sign of the scale is the byte order, its size is not used). ``.bin``: COLMAP's ``W&H&1&``,
-    then float32 rows (mvs/mat.h). PNG of 8 or 16 bits, TIFF of 8, 16 or 32 bits or floats.
-    OpenEXR: the channel Z, else depth, D, Y, V or R, else the only one.
+    ``depth``, else ``arr_0``, else the only one. ``.pfm``: one channel (Debevec's format; rows are
+    kept bottom first; the sign of the scale is the byte order, its size is not used). ``.bin``:
+    COLMAP's ``W&H&1&``, then float32 rows (mvs/mat.h). PNG of 8 or 16 bits, TIFF of 8, 16 or 32
+    bits or floats. OpenEXR: the channel Z, else depth, D, Y, V or R, else the only one.
     """
     path = Path(path)
-    data, kind = read_bytes(path), None
+    data = read_bytes(path)
     with translate_errors(path, "a depth map"):
         suffix = path.suffix.lower()
-        if suffix == ".npz":
-            values, kind = _read_npz(data)
-        else:
-            values = _READERS[suffix](path, data)
+        values = _READERS[suffix](path, data)
         if suffix in {".npy", ".npz"} and values.ndim == 3:  # [1, H, W] or [H, W, 1]
             short = next((axis for axis in (0, 2) if values.shape[axis] == 1), None)
             values = values if short is None else values.squeeze(short)
         check_stored(values.shape, values.dtype)
-        return StoredDepth(values, kind)
+        return values
 
 
 def read_confidence(path: StrPath) -> UInt8[np.ndarray, "H W"]:
@@ -98,7 +87,7 @@ def check_stored(shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
         raise ValueError(f"{size} of {dtype}, not height x width real numbers")
 
 
-def _read_npz(data: bytes) -> StoredDepth:
+def _read_npz(_: Path, data: bytes) -> np.ndarray:
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
 
         def member(name: str) -> np.ndarray:
@@ -109,15 +98,12 @@ def _read_npz(data: bytes) -> StoredDepth:
             with archive.open(info) as file:
                 return read_npy(file, size)
 
-        names = {n.removesuffix(".npy") for n in archive.namelist() if n.endswith(".npy")}
-        kind: Any = str(member("kind").reshape(-1)[0]) if "kind" in names else None
-        if kind is not None and kind not in KINDS:
-            raise ValueError(f"kind {kind!r}, not one of {', '.join(KINDS)}")
-        arrays = sorted(names - {"kind"})
+        names = (name for name in archive.namelist() if name.endswith(".npy"))
+        arrays = sorted({name.removesuffix(".npy") for name in names})
         wanted = [key for key in _NPZ_KEYS if key in arrays] or arrays
         if not wanted or (wanted[0] not in _NPZ_KEYS and len(arrays) > 1):
             raise ValueError(f"arrays {', '.join(arrays[:5])}: several, and none named depth")
-        return StoredDepth(member(wanted[0]), kind)
+        return member(wanted[0])
 
 
 def _read_pfm(_: Path, data: bytes) -> np.ndarray:
@@ -176,6 +162,7 @@ def _read_exr(path: Path, _: bytes) -> np.ndarray:
 
 _READERS: dict[str, Callable[[Path, bytes], np.ndarray]] = {
     ".npy": lambda _, data: read_npy(io.BytesIO(data), len(data)),
+    ".npz": _read_npz,
     ".exr": _read_exr,
     ".pfm": _read_pfm,
     ".bin": _read_colmap,
@@ -183,5 +170,5 @@ _READERS: dict[str, Callable[[Path, bytes], np.ndarray]] = {
     ".tif": _read_picture,
     ".png": _read_picture,
 }
-SUFFIXES = (".npy", ".npz", *[suffix for suffix in _READERS if suffix != ".npy"])
+SUFFIXES = tuple(_READERS)
 """Suffixes of depth files, in order of preference: a PNG beside another file is its preview."""

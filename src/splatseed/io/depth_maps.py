@@ -7,6 +7,13 @@ number), ``a/X.depth`` for ``a/X.color.png`` (7-Scenes), ``a/b`` and ``a/b_depth
 order, each with ``SUFFIXES``. The confidence of ``depth_N.png`` or ``frame_N.exr`` is
 ``conf_N.png``, that of ``depth/b.png`` is ``confidence/b.png`` beside the folder. Promise: maps are
 float32 with NaN where unknown; reading is thread-safe.
+
+Output of ``splatseed undistort`` and ``sfm`` has ``distorted.json``, with the original lenses: by
+image name, ``model``, ``width``, ``height`` and ``params`` in COLMAP's terms. If the undistorted
+photographs have another size, maps of the original size are undistorted on reading; if they have
+another aspect ratio, so are a sensor's maps, which have confidences, of the original aspect ratio.
+Other maps are taken to be made from the undistorted photographs, since a network's may have any
+size.
 """
 
 from __future__ import annotations
@@ -14,7 +21,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -26,6 +33,7 @@ from splatseed.camera import Intrinsics
 from splatseed.depthmap import DepthKind, DepthMap
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
 from splatseed.findings import Finding
+from splatseed.io.camera_records import make_intrinsics
 from splatseed.io.depth_files import KINDS, SUFFIXES, check_stored, read_confidence, read_stored
 from splatseed.io.files import COPY_AGAIN, read_json, translate_errors
 from splatseed.io.staging import MANIFEST, output_folder, write_json
@@ -38,6 +46,8 @@ CAMERA_FILE = "cam_params.json"
 """Camera and depth scale of an RGB-D capture, in its folder or the parent."""
 DESCRIPTION = "depths.json"
 """The file that describes the maps of a folder."""
+LENSES = "distorted.json"
+"""The file of the original lenses, in the folder of an undistorted scene."""
 
 DISTORTED_MAPS, WITHOUT_CONFIDENCE = "distorted-depth-maps", "depth-maps-without-confidence"
 """Kinds of findings about maps."""
@@ -87,7 +97,7 @@ class DepthFiles:
     paths: Mapping[str, Path]
     """The maps' files by image name."""
     kind: DepthKind | None = None
-    """Meaning of the values; None: as the file declares, else planar z."""
+    """Meaning of the values; None: planar z."""
     scale: float | None = None
     """Stored units per scene unit; None: 1000 for integers, 1 for floats."""
     lens: Undistortion | None = None
@@ -122,8 +132,8 @@ class DepthFiles:
         if path is None:
             fix = "Skip this image."
             raise SceneNotFoundError(f"a depth map of {name}", found="none", fix=fix)
-        stored, declared = read_stored(path)
-        kind, is_integer = self.kind or declared or "z", stored.dtype.kind in "ui"
+        stored = read_stored(path)
+        kind, is_integer = self.kind or "z", stored.dtype.kind in "ui"
         divisor = self.scale or (_INTEGER_SCALE if is_integer else 1.0)
         with np.errstate(over="ignore", invalid="ignore"):  # becomes infinite, and so NaN
             values: np.ndarray = (stored / np.float64(divisor)).astype(np.float32)
@@ -182,6 +192,58 @@ def find_confidences(paths: Mapping[str, Path]) -> dict[str, Path]:
         if file := next((place for place in places if place.is_file()), None):
             found[name] = file
     return found
+
+
+def write_lenses(folder: Path, lenses: Mapping[str, Intrinsics]) -> None:
+    """Write the lenses of photographs with distortion, by image name, if there are any."""
+    bent = {
+        name: {"model": lens.model, "width": lens.width, "height": lens.height,
+               "params": list(lens.params)}
+        for name, lens in sorted(lenses.items())
+        if lens.has_distortion
+    }  # fmt: skip
+    if bent:
+        write_json(folder / LENSES, bent)
+
+
+def fitted_to_undistorted(scene: Scene, maps: DepthFiles) -> DepthFiles:
+    """Return maps with the undistortion that the scene's photographs have had, if they need it."""
+    path = scene.source.root and scene.source.root / LENSES
+    if path is None or not path.is_file() or maps.lens is not None:
+        return maps
+    images = [image for image in scene.images if image.name in maps]
+    before = _read_lenses(path)
+    cameras = {im.name: im.intrinsics for im in images if im.name in before}
+    if not cameras:
+        return maps
+    name, camera = next(iter(cameras.items()))
+    height, width = read_stored(maps.paths[name]).shape
+    lens = before[name]
+    same_size = (width, height) == (lens.width, lens.height) != (camera.width, camera.height)
+    same_shape = (
+        width * lens.height == height * lens.width
+        and width * camera.height != height * camera.width
+    )
+    if not (same_size or (same_shape and maps.confidences)):
+        return maps
+    share = width / lens.width  # of a photograph's pixels
+    reduced = {
+        name: camera.resized(round(camera.width * share), round(camera.height * share))
+        for name, camera in cameras.items()
+    }
+    return replace(maps, lens=Undistortion(before, reduced))
+
+
+def _read_lenses(path: Path) -> dict[str, Intrinsics]:
+    content = read_json(path)
+    fix = "Undistort the scene again."
+    with translate_errors(path, "lenses by image name, as splatseed undistort writes", fix=fix):
+        return {
+            name: make_intrinsics(
+                f"{path}, {name}", 1, each["model"], each["width"], each["height"], each["params"]
+            )
+            for name, each in content.items()
+        }
 
 
 def map_findings(maps: object) -> list[Finding]:

@@ -34,6 +34,8 @@ from splatseed.text import beginning, describe_error
 StrPath = str | os.PathLike[str]
 """A path argument of a function that reads or writes files."""
 
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
+"""Of photographs; one that is named without a suffix is searched for in this order."""
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".3gp"})
 COPY_AGAIN = "Copy the file again, or export it again."
 ARCHIVE_FAILURES = (
@@ -73,6 +75,17 @@ def files_below(folder: Path) -> list[Path]:
             folders[:] = [name for name in folders if not is_hidden(name)]
             found += [Path(place, name) for name in names if not is_hidden(name)]
     return sorted(found)
+
+
+def image_names(folder: Path) -> list[str]:
+    """Return the sorted names of the image files in a folder, hidden ones left out; [] without."""
+    names = [path.name for path in folder.iterdir()] if folder.is_dir() else []
+    return sorted(n for n in names if Path(n).suffix.lower() in IMAGE_SUFFIXES and not is_hidden(n))
+
+
+def absolute(path: Path) -> Path:
+    """Return an absolute path without ``..``; links are not followed, so names are as in COLMAP."""
+    return Path(os.path.abspath(path))  # noqa: PTH100  (resolve would follow links)
 
 
 def is_hidden(name: str) -> bool:
@@ -145,12 +158,7 @@ def read_bytes(path: Path) -> bytes:
 
 @contextmanager
 def translate_read_errors(path: Path) -> Iterator[None]:
-    """Turn an ``OSError`` from reading a file into a ``SplatseedError``.
-
-    Raises:
-        SceneNotFoundError: There is no such file.
-        SceneFormatError: It cannot be read (a folder, no permission, a failing disk).
-    """
+    """Turn an ``OSError`` from reading a file into a ``SplatseedError``."""
     try:
         yield
     except SplatseedError:
@@ -167,13 +175,7 @@ def translate_read_errors(path: Path) -> Iterator[None]:
 
 @contextmanager
 def translate_errors(path: Path, expected: str, *, fix: str = COPY_AGAIN) -> Iterator[None]:
-    """Turn any exception from parsing a file into ``SceneFormatError``.
-
-    Args:
-        path: The file.
-        expected: The expected content, for the message "expected PATH to be ...".
-        fix: Advice for the user.
-    """
+    """Turn any exception from parsing a file into ``SceneFormatError``, "PATH to be EXPECTED"."""
     try:
         yield
     except SplatseedError:
@@ -228,6 +230,12 @@ def numbered_lines(path: Path) -> Iterator[tuple[str, str]]:
         ) from None
     for number, line in enumerate(text.split("\n"), start=1):
         yield f"{path}, line {number}", line
+
+
+def is_data(line: str) -> bool:
+    """Whether a line of a text file is neither blank nor a comment."""
+    stripped = line.lstrip()
+    return bool(stripped) and not stripped.startswith("#")
 
 
 def read_json(path: Path, expected: str = "JSON", *, fix: str = COPY_AGAIN) -> Any:

@@ -8,7 +8,6 @@ another name is never used.
 from __future__ import annotations
 
 import math
-import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -22,11 +21,9 @@ from splatseed.errors import SceneFormatError
 from splatseed.findings import Finding
 from splatseed.io.depth_files import SUFFIXES as DEPTH_SUFFIXES
 from splatseed.io.depth_maps import DepthFiles, find_confidences
-from splatseed.io.files import read_json
+from splatseed.io.files import IMAGE_SUFFIXES, absolute, read_json
 from splatseed.text import counted
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
-"""Tried in this order, in any case, for a photograph named without a suffix."""
 _PHOTOGRAPHS = ("images", "image", "input", "rgb", "images_2", "images_4", "images_8")
 _SCANNETPP = ("../resized_images", "../resized_undistorted_images")
 _MASKS = ("masks", "mask", "../resized_anon_masks", "../resized_undistorted_masks")
@@ -54,7 +51,7 @@ class FrameFiles:
         """Find the photographs that frames name, without those that are missing."""
         undistorted = "undistorted" in self.path.name
         folders = _SCANNETPP[::-1] if undistorted else _SCANNETPP
-        return self._find_all(names, (*_PHOTOGRAPHS, *folders), SUFFIXES)
+        return self._find_all(names, (*_PHOTOGRAPHS, *folders), IMAGE_SUFFIXES)
 
     def masks(self, names: Iterable[str]) -> dict[str, Found]:
         """Find the masks that frames name, without those that are missing."""
@@ -69,7 +66,7 @@ class FrameFiles:
         plain = name.replace("\\", "/")
         if folder is not None and _DRIVE.match(plain):
             return folder / PurePosixPath(plain).name
-        return _absolute(self.path.parent / plain)
+        return absolute(self.path.parent / plain)
 
     def _find_all(
         self, names: Iterable[str], folders: Sequence[str], suffixes: Sequence[str]
@@ -85,7 +82,7 @@ class FrameFiles:
         spellings = list(dict.fromkeys(_spellings(name)))
         moved = _DRIVE.match(spellings[-1]) or ".." in PurePosixPath(spellings[-1]).parts
         for each in spellings:
-            path = _absolute(root / each)
+            path = absolute(root / each)
             if path.is_file():
                 return Found(path)
             if suffixes and (near := self._near(path, suffixes, exact=True)):
@@ -95,7 +92,7 @@ class FrameFiles:
         ends = [root.joinpath(*parts[start:]) for start in range(len(parts))]
         if moved or len(parts) == 1:  # else the folder may distinguish files of one name
             ends += [root / folder / parts[-1] for folder in folders if parts]
-        for end in map(_absolute, ends):
+        for end in map(absolute, ends):
             if near := self._near(end, suffixes):
                 return Found(near, relocated=True)
         return None
@@ -122,10 +119,6 @@ def _spellings(name: str) -> Iterator[str]:
     yield name
     yield name.replace("\\", "/")
     yield unquote(name.replace("\\", "/"))
-
-
-def _absolute(path: Path) -> Path:
-    return Path(os.path.abspath(path))  # noqa: PTH100  (resolve would follow links)
 
 
 class Frame(NamedTuple):
@@ -188,7 +181,6 @@ def find_frames(path: Path, meta: Any) -> tuple[list[Frame], list[Finding]]:
 
 
 def _listed(path: Path, meta: Any) -> list[_Listed]:
-    """List all frames of a file, training and test."""
     frames = meta.get("frames") if isinstance(meta, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
         found = "another type" if frames else "none"
@@ -208,7 +200,6 @@ def _listed(path: Path, meta: Any) -> list[_Listed]:
 
 
 def _moved(path: Path, listed: Sequence[_Listed]) -> list[Finding]:
-    """Report photographs found in another place than named."""
     moved = {each.name: each.found.path for each in listed if each.found and each.found.relocated}
     if not moved:
         return []
@@ -227,11 +218,15 @@ def named_masks(
     found = files.masks(named.values())
     missing = [mask for mask in named.values() if mask not in found]
     masks = {name: found[mask].path for name, mask in named.items() if mask in found}
+    return masks, _not_found(files, "mask", missing)
+
+
+def _not_found(files: FrameFiles, noun: str, missing: Sequence[str]) -> list[Finding]:
     if not missing:
-        return masks, []
-    what = f"{counted(len(missing), 'mask')} named in {files.path.name} cannot be found"
-    text = f"{what}, such as {missing[0]}."
-    return masks, [Finding("missing-masks", text, subjects=tuple(missing))]
+        return []
+    what = f"{counted(len(missing), noun)} named in {files.path.name} cannot be found"
+    kind = f"missing-{noun.replace(' ', '-')}s"
+    return [Finding(kind, f"{what}, such as {missing[0]}.", subjects=tuple(missing))]
 
 
 def named_depths(
@@ -252,11 +247,8 @@ def named_depths(
         for name, depth in named.items():
             if depth in found and found[depth].path.suffix.lower() in DEPTH_SUFFIXES:
                 paths[name], key_used = found[depth].path, key_used or key
-    findings = []
-    if lost := [depth for name, depth in missing.items() if name not in paths]:
-        what = f"{counted(len(lost), 'depth map')} named in {files.path.name} cannot be found"
-        text = f"{what}, such as {lost[0]}."
-        findings = [Finding("missing-depth-maps", text, subjects=tuple(lost))]
+    lost = [depth for name, depth in missing.items() if name not in paths]
+    findings = _not_found(files, "depth map", lost)
     if not paths:
         return None, findings
     unit = _depth_unit(files, key_used, paths, [{**meta, **frames[name]} for name in paths])

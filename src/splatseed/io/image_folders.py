@@ -12,9 +12,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path, PurePath
 
-from splatseed.io.extraction import is_extracted
 from splatseed.io.files import open_file
 from splatseed.io.mask_files import FOLDER as MASKS
+from splatseed.io.recordings import is_extracted
 from splatseed.scene import Scene
 
 _KINDS = ("images", MASKS, "depths")

@@ -19,8 +19,7 @@ from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.camera_records import make_intrinsics, rigid_pose
 from splatseed.io.colmap_model import IMAGE_DIRS
-from splatseed.io.files import StrPath, is_hidden, open_file, read_npy, translate_errors
-from splatseed.io.frame_files import SUFFIXES
+from splatseed.io.files import StrPath, image_names, open_file, read_npy, translate_errors
 from splatseed.io.mask_files import masks_among
 from splatseed.io.origin import recentered
 from splatseed.io.photograph_checks import photograph_findings, photograph_size
@@ -79,11 +78,9 @@ def _read_rows(path: Path) -> Float64[np.ndarray, "N 17"]:
 
 
 def _photographs(root: Path, count: int) -> tuple[Path, list[str]]:
-    """Find the first folder with one photograph per pose, and their sorted names."""
     found = dict[Path, list[str]]()
     for folder in (root / name for name in IMAGE_DIRS):
-        files = [each.name for each in folder.iterdir()] if folder.is_dir() else []
-        names = [n for n in files if Path(n).suffix.lower() in SUFFIXES and not is_hidden(n)]
+        names = image_names(folder)
         found[folder] = sorted(set(names) - masks_among(names))
         if len(found[folder]) == count:
             return folder, found[folder]

@@ -14,7 +14,6 @@ from pathlib import Path
 from splatseed.depthmap import DepthKind
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError, SplatseedError
 from splatseed.findings import Finding, without_kinds
-from splatseed.io.bit_depth import find_white
 from splatseed.io.cleaning import clean_scene, outlier_findings
 from splatseed.io.colmap_model import find_model, nested_model, read_model, scene_model, scene_root
 from splatseed.io.depth_files import KINDS, SUFFIXES
@@ -22,6 +21,7 @@ from splatseed.io.depth_maps import (
     DISTORTED_MAPS,
     WITHOUT_CONFIDENCE,
     DepthFiles,
+    fitted_to_undistorted,
     map_findings,
     match_by_name,
 )
@@ -29,6 +29,7 @@ from splatseed.io.files import StrPath, is_video, special_kind
 from splatseed.io.llff import is_llff, read_llff
 from splatseed.io.nerfstudio import is_blender, read_blender, read_transforms_scene
 from splatseed.io.origin import recentered
+from splatseed.io.picture import find_white
 from splatseed.io.ply import read_ply_float64, refuse_gaussians
 from splatseed.io.polycam import is_polycam, read_polycam
 from splatseed.io.record3d import (
@@ -39,14 +40,12 @@ from splatseed.io.record3d import (
     read_r3d,
     read_record3d,
 )
-from splatseed.io.recorded import restore_absent, with_recorded_masks
 from splatseed.io.rgbd import find_tum_depths, is_replica, is_tum, load_rgbd, load_tum
 from splatseed.io.scanner_app import is_scanner_app, read_scanner_app
-from splatseed.io.seeds import recall_seeds
+from splatseed.io.seeds import recall_seeds, restore_absent, with_recorded_masks
 from splatseed.io.split import with_listed_split
 from splatseed.io.staging import MANIFEST, read_manifest
 from splatseed.io.stray import is_stray, read_stray
-from splatseed.io.undistorted import fitted_to_undistorted
 from splatseed.scene import Scene, SceneSource
 from splatseed.text import name_some, quoted
 
@@ -162,7 +161,6 @@ def is_scene(folder: StrPath) -> bool:
 
 
 def _reader(folder: Path) -> Callable[[], Scene] | None:
-    """Choose the reader of a folder by the names of its files."""
     if read_manifest(folder).get("format") == "both" and (folder / _TRANSFORMS).is_file():
         return partial(read_transforms_scene, folder / _TRANSFORMS)  # it says more: masks, depth
     if (model := scene_model(folder)) is not None:
@@ -273,7 +271,7 @@ def find_depths(
         path: A folder of maps named like the images, subfolders included; a COLMAP dense workspace;
             an RGB-D capture in NICE-SLAM's or TUM's layout; a recording of Record3D; or the output
             of ``splatseed depth``.
-        kind: Meaning of the values; None: as the folder or file declares, else planar z.
+        kind: Meaning of the values; None: as the folder declares, else planar z.
         scale: Stored units per scene unit; None: as the folder declares, else 1000 for integers
             and 1 for floats.
 
@@ -329,7 +327,6 @@ def _with_maps(scene: Scene, maps: DepthFiles | None) -> Scene:
 
 
 def _same_maps(maps: DepthFiles, others: DepthFiles) -> bool:
-    """Whether two sets of maps are the same files, in the same unit."""
     if maps.scale != others.scale or maps.paths.keys() != others.paths.keys():
         return False
     return all(path.samefile(others.paths[name]) for name, path in maps.paths.items())

@@ -14,11 +14,11 @@ from collections.abc import Collection
 from pathlib import Path, PurePosixPath
 
 from splatseed.findings import Finding
-from splatseed.io.files import files_below
+from splatseed.io.files import IMAGE_SUFFIXES, files_below
 from splatseed.text import agreeing, counted
 
 FOLDER = "masks"
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".gif")
+SUFFIXES = (*IMAGE_SUFFIXES, ".gif")
 _FOLDERS = ("masks", "mask")
 _MASK_LIKE = ("mask", "segment")
 """Parts of folder names that suggest masks of unknown polarity."""

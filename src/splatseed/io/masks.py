@@ -21,12 +21,12 @@ from PIL import Image as PilImage
 from splatseed.camera import Intrinsics, same_shape
 from splatseed.errors import SceneFormatError, SceneNotFoundError, SplatseedError
 from splatseed.findings import Finding, without_kinds
-from splatseed.io.bit_depth import is_16_bit, opaque_value, read_16_bit
 from splatseed.io.depth_maps import Undistortion
 from splatseed.io.files import files_below, read_bytes, translate_errors
 from splatseed.io.mask_files import SUFFIXES, find_masks, find_own_masks, masks_among
 from splatseed.io.photograph import has_alpha, open_photograph, photograph_bytes
 from splatseed.io.photograph_checks import photograph_size
+from splatseed.io.picture import is_16_bit, opaque_value, read_16_bit
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.sampling import strided
 from splatseed.scene import Masks, Scene
@@ -128,8 +128,8 @@ def _mostly_masked(masks: Masks, fix: str = f"use `masks={INVERTED!r}`") -> list
     """
     files, shares = [*masks.files.values()], list[float]()
     for path in strided(files, _SAMPLE) if not masks.inverted else ():
-        with suppress(SplatseedError), translate_errors(path, "a mask"):  # reported when used
-            shares.append(1.0 - float(_read_counts(open_photograph(path, read_bytes(path))).mean()))
+        with suppress(SplatseedError):  # reported when used
+            shares.append(1.0 - float(_read_counts(path).mean()))
     if not shares or (share := float(np.mean(shares))) < _MOST:
         return []
     what = f"Masks leave out {share:.0%} of the pixels of their photographs"
@@ -155,11 +155,7 @@ def read_mask(
 ) -> Bool[np.ndarray, "h w"] | None:
     """Read which pixels of a photograph are valid; None if all are.
 
-    Args:
-        masks: The scene's masks.
-        name: The image's name.
-        photograph: The image's file.
-        factor: Integer reduction; a reduced pixel is valid if its ``factor``^2 block is.
+    A pixel reduced by an integer ``factor`` is valid if all ``factor``^2 are.
 
     Raises:
         SceneNotFoundError: The mask's file is missing.
@@ -169,14 +165,12 @@ def read_mask(
         return None
     path, parts = masks.files.get(name), []
     if path is not None:
-        with translate_errors(path, "a mask, an image of one channel"):
-            picture = open_photograph(path, read_bytes(path))
-            marked = _read_counts(picture) != masks.inverted
-        size = open_photograph(photograph, photograph_bytes(photograph)).size
-        if not same_shape(picture.size, size):
+        marked = _read_counts(path) != masks.inverted
+        (height, width), size = marked.shape, photograph_size(photograph)
+        if not same_shape((width, height), size):
             raise SceneFormatError(
                 f"the mask {path} to have the size of {name}, {size[0]} x {size[1]}",
-                found=f"{picture.size[0]} x {picture.size[1]}",
+                found=f"{width} x {height}",
                 fix="Make it from that photograph, without cropping or rotating it.",
             )
         parts.append(_fitted(marked, size))
@@ -199,15 +193,17 @@ def read_mask(
     return None if counts.all() else np.asarray(counts)
 
 
-def _read_counts(picture: PilImage.Image) -> Bool[np.ndarray, "H W"]:
-    """Return the pixels of a mask that are neither 0 nor transparent."""
-    if picture.mode.startswith(("I", "F")):  # Pillow's conversion would clip
-        return np.asarray(np.asarray(picture) > 0)
-    threshold = 128 if picture.format in _LOSSY else 1
-    counts = np.asarray(picture.convert("L")) >= threshold
-    if has_alpha(picture):
-        counts &= np.asarray(picture.convert("RGBA").getchannel("A")) > 0
-    return np.asarray(counts)
+def _read_counts(path: Path) -> Bool[np.ndarray, "H W"]:
+    """Read which pixels of a mask are neither 0 nor transparent."""
+    with translate_errors(path, "a mask, an image of one channel"):
+        picture = open_photograph(path, read_bytes(path))
+        if picture.mode.startswith(("I", "F")):  # Pillow's conversion would clip
+            return np.asarray(np.asarray(picture) > 0)
+        threshold = 128 if picture.format in _LOSSY else 1
+        counts = np.asarray(picture.convert("L")) >= threshold
+        if has_alpha(picture):
+            counts &= np.asarray(picture.convert("RGBA").getchannel("A")) > 0
+        return np.asarray(counts)
 
 
 def _fitted(counts: Bool[np.ndarray, "H W"], size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
@@ -226,12 +222,13 @@ def _opaque(photograph: Path) -> Bool[np.ndarray, "H W"] | None:
     """Return the fully opaque pixels; None for files without transparency."""
     if photograph.suffix.lower() in {".jpg", ".jpeg"}:  # never transparent: skip reading
         return None
-    picture = open_photograph(photograph, photograph_bytes(photograph))
+    encoded = photograph_bytes(photograph)
+    picture = open_photograph(photograph, encoded)
     if not has_alpha(picture) or picture.mode.startswith(("I", "F")):
         return None
     with translate_errors(photograph, "an image, neither cut short nor damaged"):
         if is_16_bit(picture):
-            alpha = read_16_bit(photograph_bytes(photograph))[..., -1]
+            alpha = read_16_bit(encoded)[..., -1]
             return np.asarray(alpha == opaque_value(alpha))
         return np.asarray(np.asarray(picture.convert("RGBA").getchannel("A")) == 255)
 
@@ -257,7 +254,7 @@ def write_masks(
             fitting = _undistorted(counts, *lenses[name]) if lenses else counts
             _write(folder / f"{name}.png", fitting)
     for name in unmasked if folder.is_dir() else ():
-        width, height = open_photograph(image_dir / name, photograph_bytes(image_dir / name)).size
+        width, height = photograph_size(image_dir / name)
         if lenses:
             width, height = lenses[name][1].width, lenses[name][1].height
         _write(folder / f"{name}.png", np.ones((height, width), np.bool_))
@@ -271,7 +268,6 @@ def _write(path: Path, counts: Bool[np.ndarray, "H W"]) -> None:
 def _undistorted(
     counts: Bool[np.ndarray, "H W"], lens: Intrinsics, pinhole: Intrinsics
 ) -> Bool[np.ndarray, "h w"]:
-    """Undistort a mask."""
     if lens == pinhole:  # the photograph is a copy
         return counts
     # Undistortion interpolates four pixels, all within one pixel of the nearest.

@@ -25,20 +25,17 @@ from splatseed.errors import SceneFormatError
 from splatseed.findings import Finding
 from splatseed.io.camera_records import (
     MAX_ID,
+    OPENCV_FROM_OPENGL,
     NotFiniteError,
     check_enough,
     make_intrinsics,
     rigid_pose,
     unusable_findings,
 )
-from splatseed.io.colmap_model import (
-    find_model,
-    ranked_models,
-    read_model_cameras,
-    read_model_points,
-)
+from splatseed.io.colmap_model import models_in, read_model_cameras, read_model_points
 from splatseed.io.files import (
     StrPath,
+    absolute,
     open_file,
     read_bytes,
     read_json,
@@ -46,6 +43,7 @@ from splatseed.io.files import (
     translate_errors,
 )
 from splatseed.io.frame_files import (
+    FIX,
     Frame,
     FrameFiles,
     any_photograph,
@@ -64,12 +62,8 @@ from splatseed.scene import OPENGL, Image, Masks, Scene, SceneSource, Split
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
 from splatseed.text import counted
 
-OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Converts camera axes between OpenGL and OpenCV."""
-
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-_FIX = "Correct the file, or export the scene again."
 _CONVENTION = f"each transform_matrix is world_from_cam, {OPENGL}"
 NERFSTUDIO = "dataparser_transforms.json"
 _MATRIX_KEYS = ("transform", "matrix", "transform_matrix", "transformation")
@@ -196,12 +190,12 @@ def read_blender(folder: StrPath) -> Scene:
 
 def read_transforms(path: Path) -> Transforms:
     """Read the cameras and frames of a ``transforms.json``, without points."""
-    meta = read_json(path, fix=_FIX)
+    meta = read_json(path, fix=FIX)
     frames, findings = find_frames(path, meta)
     # The subfolder that contains all images, else the deepest common folder. Links are not
     # followed, so that names are as in COLMAP.
     image_dir = Path(os.path.commonpath([frame.file.parent for frame in frames]))
-    root = Path(os.path.abspath(path)).parent  # noqa: PTH100
+    root = absolute(path).parent
     if root in image_dir.parents:
         image_dir = root / image_dir.relative_to(root).parts[0]
     named = [frame.fields.get("colmap_im_id") for frame in frames]
@@ -252,11 +246,10 @@ def read_transforms(path: Path) -> Transforms:
 
 
 def _check_repeated(where: str, first: Image, again: Image) -> None:
-    """Raise ``SceneFormatError`` if frames give an image two poses or cameras."""
     same = np.allclose(first.quat, again.quat) and np.allclose(first.translation, again.translation)
     if not same or first.intrinsics != again.intrinsics:
         expected = f"{where} to have an image of its own"
-        raise SceneFormatError(expected, found=f"{again.name!r} again, elsewhere", fix=_FIX)
+        raise SceneFormatError(expected, found=f"{again.name!r} again, elsewhere", fix=FIX)
 
 
 def apply_transform(
@@ -274,7 +267,7 @@ def _number(where: str, values: Mapping[str, Any], key: str, default: float | No
     if not math.isfinite(number):
         other = "none" if value is None else repr(value)
         kind = NotFiniteError if isinstance(value, float) else SceneFormatError
-        raise kind(f"a number {key} in {where}", found=other, fix=_FIX)
+        raise kind(f"a number {key} in {where}", found=other, fix=FIX)
     return number
 
 
@@ -286,7 +279,7 @@ def _camera(
         width, height = int(_number(where, values, "w")), int(_number(where, values, "h"))
     else:
         expected = f"a readable image, or w and h to be, in {where}"
-        with translate_errors(file, expected, fix=_FIX), open_file(file) as opened:
+        with translate_errors(file, expected, fix=FIX), open_file(file) as opened:
             width, height = open_picture(opened).size
     fl_x = _focal_length(where, values, "x", width, None)
     fl_y = _focal_length(where, values, "y", height, fl_x)
@@ -303,13 +296,13 @@ def _focal_length(
         radians = _number(where, values, f"camera_angle_{axis}")
         if not 0 < radians < math.pi:
             expected = f"a camera_angle_{axis} between 0 and pi, in radians, in {where}"
-            raise NotFiniteError(expected, found=f"{radians:g}", fix=_FIX)
+            raise NotFiniteError(expected, found=f"{radians:g}", fix=FIX)
         focal_length = 0.5 * size / math.tan(radians / 2)
     else:
         focal_length = _number(where, values, f"fl_{axis}", default)
     if not 0 < focal_length < math.inf:
         expected = f"a positive focal length fl_{axis} in {where}"
-        raise NotFiniteError(expected, found=f"{focal_length:g}", fix=_FIX)
+        raise NotFiniteError(expected, found=f"{focal_length:g}", fix=FIX)
     return focal_length
 
 
@@ -340,10 +333,10 @@ def _matrix(where: str, value: Any) -> Float64[np.ndarray, "3 4"]:
     fits = matrix.shape in {(3, 4), (4, 4)}
     if fits and not (np.isfinite(matrix[:3]).all() and matrix[:3, :3].any()):
         found = "only zeros" if np.isfinite(matrix[:3]).all() else "NaN or infinity"
-        raise NotFiniteError(f"a matrix of finite numbers in {where}", found=found, fix=_FIX)
+        raise NotFiniteError(f"a matrix of finite numbers in {where}", found=found, fix=FIX)
     if not fits:
         found = "none" if value is None else "another shape"
-        raise SceneFormatError(f"a matrix of 3 x 4 numbers in {where}", found=found, fix=_FIX)
+        raise SceneFormatError(f"a matrix of 3 x 4 numbers in {where}", found=found, fix=FIX)
     return matrix[:3]
 
 
@@ -383,15 +376,12 @@ def _find_points(
 def _models(root: Path) -> list[Path]:
     """List the COLMAP models near a ``transforms.json``, most likely first."""
     places = (root / "colmap/sparse", root / "sparse")
-    found = next(filter(None, map(ranked_models, places)), [])
-    flat = find_model(*places)
-    return found or ([flat] if flat else [])
+    return next(filter(None, map(models_in, places)), [])
 
 
 def _points_of_model(
     transforms: Transforms, model_dir: Path, findings: list[Finding]
 ) -> tuple[PointCloud, Float64[np.ndarray, "N 3"], Path, list[Finding]]:
-    """Read the points of a COLMAP model and map them into the transforms' space."""
     points, exact, _, points_path = read_model_points(model_dir)
     model_images = read_model_cameras(model_dir)[1]
     transform, doubts = _transform_of_model(transforms, model_dir, model_images)

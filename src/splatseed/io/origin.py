@@ -103,7 +103,7 @@ def translated(
         tracks = replace(tracks, xyz=tracks.xyz - offset)
     with np.errstate(over="ignore", invalid="ignore"):  # non-finite points are dropped later
         points = scene.points.replace(xyz=(xyz.astype(np.float64) - offset).astype(np.float32))
-    images = tuple(_translated_image(image, offset) for image in scene.images)
+    images = tuple(translated_image(image, offset) for image in scene.images)
     # The origin directly: a scene's own ``replace`` looks whose tracks new points keep.
     return replace(scene, points=points, images=images, tracks=tracks, origin=scene.origin + offset)
 
@@ -169,11 +169,7 @@ def add_offset(folder: Path, offset: Float64[np.ndarray, " 3"]) -> None:
 
 
 def offset_beside(path: Path) -> Float64[np.ndarray, " 3"] | None:
-    """Read the offset of a folder or a file; None if not recorded.
-
-    Raises:
-        SceneFormatError: The record is malformed.
-    """
+    """Read the offset of a folder or a file; None if not recorded."""
     own = path.with_name(f"{path.name}.{RECENTER}")
     places = (path / RECENTER,) if path.is_dir() else (own, path.parent / RECENTER)
     file = next((each for each in places if each.is_file()), None)
@@ -199,7 +195,6 @@ def format_offset(offset: Sequence[float] | np.ndarray) -> str:
 
 
 def _with_offset(scene: Scene) -> Scene:
-    """Set a scene's offset from the record beside its files."""
     source = scene.source
     place = source.points_path if source.format == "ply" else source.root
     offset = None if place is None else offset_beside(place)
@@ -220,7 +215,8 @@ def _middle(places: Float64[np.ndarray, "N 3"]) -> tuple[Float64[np.ndarray, " 3
     return middle, 2 * float(np.median(np.abs(places - middle).max(axis=1)))
 
 
-def _translated_image(image: Image, offset: Float64[np.ndarray, " 3"]) -> Image:
+def translated_image(image: Image, offset: Float64[np.ndarray, " 3"]) -> Image:
+    """Subtract an offset from the position of an image's camera."""
     rotation = image.camera.cam_from_world[:3, :3]
     return replace(image, translation=image.translation + rotation @ offset)
 
@@ -257,7 +253,6 @@ def _lost_precision(
 
 
 def _other_frame(scene: Scene, centers: Float64[np.ndarray, "I 3"]) -> list[Finding]:
-    """Report points so far from the cameras that none can see them."""
     xyz = scene.points.xyz[scene.points.finite].astype(np.float64)
     if not len(xyz) or not len(centers):
         return []

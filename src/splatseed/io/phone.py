@@ -20,6 +20,7 @@ from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError
 from splatseed.findings import Finding
 from splatseed.io.camera_records import (
+    OPENCV_FROM_OPENGL,
     NotFiniteError,
     check_enough,
     make_intrinsics,
@@ -27,11 +28,11 @@ from splatseed.io.camera_records import (
     unusable_findings,
 )
 from splatseed.io.files import read_json
-from splatseed.io.nerfstudio import OPENCV_FROM_OPENGL
 from splatseed.io.origin import recentered
 from splatseed.io.photograph_checks import photograph_findings
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import OPENGL, Image, Scene, SceneSource
+from splatseed.text import agreeing, counted
 
 EXPORT_AGAIN = "Export the scan again."
 HALF_PIXEL = 0.5
@@ -61,17 +62,8 @@ def read_phone_scene(
 ) -> Scene:
     """Make a scene without points of a phone's photographs.
 
-    Args:
-        root: The export's folder.
-        track: A file of the poses.
-        folder: The folder of the photographs.
-        names: The photographs, relative to it, in order.
-        read: Returns the frame of a photograph; if it raises ``NotFiniteError``, the photograph is
-            left out.
-        findings: What the format's reader found.
-
-    Raises:
-        SceneFormatError: A camera or pose is malformed, or more than half are not finite.
+    ``track`` is a file of the poses; ``names`` are the photographs in ``folder``, in order. Those
+    for which ``read`` raises ``NotFiniteError`` are left out.
     """
     cameras: dict[tuple[object, ...], Intrinsics] = {}
     images, unusable = list[Image](), dict[str, NotFiniteError]()
@@ -103,8 +95,16 @@ def read_phone_scene(
     return recentered(scene)
 
 
+def without_photograph(count: int, total: int, noun: str) -> list[Finding]:
+    """Report records of an export that have no photograph, if any."""
+    if not count:
+        return []
+    have = agreeing(count, "has no photograph and is", "have no photograph and are")
+    text = f"{count} of {counted(total, noun)} {have} left out."
+    return [Finding("missing-photographs", text)]
+
+
 def _camera(frame: PhoneFrame, camera_id: int) -> Intrinsics:
-    """Make a checked camera; one of another size has its principal point far from the middle."""
     camera = make_intrinsics(frame.where, camera_id, "PINHOLE", *frame.size, frame.pinhole)
     offset = np.abs(np.array(frame.pinhole[2:]) / frame.size - 0.5)
     if offset.max() > _MAX_OFFSET:
@@ -128,12 +128,7 @@ def read_record(path: Path, what: str) -> dict[str, Any]:
 
 
 def read_numbers(where: str, record: Mapping[str, Any], keys: Iterable[str]) -> list[float]:
-    """Return finite numbers of a record.
-
-    Raises:
-        NotFiniteError: One is NaN or infinite.
-        SceneFormatError: One is missing, or no number.
-    """
+    """Return finite numbers of a record, else raise ``NotFiniteError``."""
     numbers = []
     for key in keys:
         value = record.get(key)
@@ -156,9 +151,7 @@ def read_matrix(
 ) -> Float64[np.ndarray, "R C"]:
     """Return a row-major matrix of finite numbers that a record stores as one list.
 
-    Raises:
-        NotFiniteError: A number is NaN, infinite, or all are 0.
-        SceneFormatError: It is missing, or not such a list.
+    Raises ``NotFiniteError`` also if all are 0.
     """
     expected = f"{rows} x {columns} numbers {key}"
     value = record.get(key)

@@ -2,7 +2,7 @@
 
 Promise: pixels are as stored, without EXIF rotation, as in COLMAP; transparent pixels are
 composited over black, the background of renders; 16 bits per channel and floats in [0, 1] are
-rounded to 8 bits, with the capture's *white* (``io.bit_depth``) as 255.
+rounded to 8 bits, with the capture's *white* (``io.picture``) as 255.
 """
 
 from __future__ import annotations
@@ -17,9 +17,8 @@ from PIL import Image as PilImage
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.findings import Finding
-from splatseed.io.bit_depth import WHITE, is_16_bit, opaque_value, read_16_bit
 from splatseed.io.files import read_bytes, similar_name, translate_errors
-from splatseed.io.picture import open_picture
+from splatseed.io.picture import WHITE, is_16_bit, opaque_value, open_picture, read_16_bit
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Image, Scene
 

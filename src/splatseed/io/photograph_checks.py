@@ -6,7 +6,6 @@ as in COLMAP: EXIF orientation is ignored. Only headers are read.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -18,10 +17,10 @@ from PIL import Image as PilImage
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.findings import Finding
-from splatseed.io.extraction import is_extracted
-from splatseed.io.files import open_file, similar_name, special_kind, translate_errors
+from splatseed.io.files import absolute, open_file, similar_name, special_kind, translate_errors
 from splatseed.io.photograph import COPY_AGAIN, photograph_bytes, photograph_folder
 from splatseed.io.picture import ORIENTATION, open_picture
+from splatseed.io.recordings import is_extracted
 from splatseed.scene import Image, Scene
 from splatseed.text import agreeing, counted, name_some
 
@@ -64,12 +63,7 @@ def with_photographs(scene: Scene) -> Scene:
 
 
 def photograph_size(path: Path) -> Size:
-    """Read width and height of an image file, once for each version of it.
-
-    Raises:
-        SceneNotFoundError: No such file.
-        SceneFormatError: Unreadable, or no image.
-    """
+    """Read width and height of an image file, once for each version of it."""
     if not path.is_file():
         photograph_bytes(path)  # raises with advice for a missing file
     with translate_errors(path, "an image", fix=COPY_AGAIN):
@@ -122,7 +116,6 @@ def check_sizes(images: Sequence[Image]) -> dict[str, Size]:
 
 
 def _misfit(image: Image, size: Size) -> tuple[str, str]:
-    """Explain why a photograph does not fit its camera, and how to fix it."""
     if not fits(image.intrinsics, size[::-1]):
         return "cropped, or stretched", (
             "Use the photographs of the reconstruction, or resized copies. A crop "
@@ -165,9 +158,8 @@ def photograph_findings(
     absent = {im.name: None for im in images if not im.has_photograph}
     findings = [_missing([*absent], len(images), image_dir)] if absent else []
     # Links are not followed: users make them on purpose.
-    around = os.path.abspath(root)  # noqa: PTH100
-    paths = {im.name: os.path.abspath(im.path) for im in images}  # noqa: PTH100
-    outside = [n for n, path in paths.items() if os.path.commonpath([path, around]) != around]
+    around = absolute(root)
+    outside = [im.name for im in images if around not in absolute(im.path).parents]
     if outside and not is_extracted(image_dir):
         lie = agreeing(len(outside), "lies", "lie")
         text = f"{len(outside)} of {len(images)} images {lie} outside of {root}"
@@ -178,12 +170,11 @@ def photograph_findings(
 
 
 def _odd_cameras(images: Sequence[Image]) -> list[Finding]:
-    """Find focal lengths and principal points that are probably of another image size."""
     odd = [image for image in images if _is_of_another_size(image.intrinsics)]
     if not odd:
         return []
     lens = odd[0].intrinsics
-    fx, fy, cx, cy = lens.K[[0, 1, 0, 1], [0, 1, 2, 2]]
+    fx, fy, cx, cy = lens.pinhole.params
     of = f"{len(odd)} of {counted(len(images), 'image')}"
     what = f"The focal lengths and principal point of {of} are probably not in pixels of this size"
     such = f"({fx:.4g}, {fy:.4g}) and ({cx:.4g}, {cy:.4g}) in {lens.width} x {lens.height}"

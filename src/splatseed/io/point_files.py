@@ -55,13 +55,9 @@ def first_with_points(paths: Sequence[Path]) -> Path | None:
 def differing_points(
     read: Path, xyz: Float[np.ndarray, "N 3"], other: Path, use: str = ""
 ) -> list[Finding]:
-    """Report another point file if its points differ from those read.
+    """Report another point file if its points differ from the positions ``xyz`` of the one read.
 
-    Args:
-        read: The file that was read.
-        xyz: Its positions.
-        other: The other file.
-        use: How to have the other file read, such as "move A out of B".
+    ``use`` says how to have the other file read, such as "move A out of B".
     """
     if not other.is_file() or not read.is_file() or other.samefile(read):
         return []
@@ -99,7 +95,6 @@ def _same(path: Path, xyz: Float[np.ndarray, "N 3"]) -> bool:
 
 
 def _age(other: Path, read: Path) -> str:
-    """Describe whether a file is newer or older than the one read."""
     seconds = other.stat().st_mtime - read.stat().st_mtime
     newer = "newer" if seconds > 0 else "older"
     return "" if abs(seconds) < 1 else f", which is {newer},"

@@ -18,9 +18,15 @@ import numpy as np
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.findings import Finding
 from splatseed.io.depth_maps import match_by_name
-from splatseed.io.files import StrPath, is_hidden
-from splatseed.io.frame_files import SUFFIXES
-from splatseed.io.phone import EXPORT_AGAIN, PhoneFrame, read_numbers, read_phone_scene, read_record
+from splatseed.io.files import StrPath, image_names, is_hidden
+from splatseed.io.phone import (
+    EXPORT_AGAIN,
+    PhoneFrame,
+    read_numbers,
+    read_phone_scene,
+    read_record,
+    without_photograph,
+)
 from splatseed.scene import Scene
 from splatseed.text import agreeing, counted, quoted
 
@@ -49,12 +55,7 @@ def _keyframes(folder: Path) -> Path | None:
 
 
 def read_polycam(root: StrPath) -> Scene:
-    """Read key frames, corrected ones if there are any, with depth maps; the cloud is empty.
-
-    Raises:
-        SceneNotFoundError: There are no cameras or no photographs.
-        SceneFormatError: A camera is malformed.
-    """
+    """Read key frames, corrected ones if there are any, with depth maps; the cloud is empty."""
     root = Path(root)
     keyframes = _keyframes(root) or root
     prefix, names, cameras = _choose(keyframes)
@@ -74,10 +75,7 @@ def read_polycam(root: StrPath) -> Scene:
         have = agreeing(len(lost), "has no camera and is", "have no camera and are")
         text = f"{len(lost)} of {len(names)} photographs {have} left out, such as {lost[0]}."
         findings.append(Finding("missing-poses", text, subjects=tuple(lost)))
-    if lacking := len(cameras) - len(used):
-        have = agreeing(lacking, "has no photograph and is", "have no photograph and are")
-        text = f"{lacking} of {counted(len(cameras), 'camera')} {have} left out."
-        findings.append(Finding("missing-photographs", text))
+    findings += without_photograph(len(cameras) - len(used), len(cameras), "camera")
 
     def read(name: str) -> PhoneFrame:
         return _read_camera(cameras[Path(name).stem])
@@ -94,9 +92,7 @@ def _choose(keyframes: Path) -> tuple[str, list[str], dict[str, Path]]:
     """
     for prefix in (_CORRECTED, ""):
         images, cameras = keyframes / f"{prefix}images", keyframes / f"{prefix}cameras"
-        listed = sorted(path.name for path in images.iterdir()) if images.is_dir() else []
-        shown = [name for name in listed if not is_hidden(name)]
-        names = [name for name in shown if Path(name).suffix.lower() in SUFFIXES]
+        names = image_names(images)
         found = (path for path in sorted(cameras.glob("*.json")) if not is_hidden(path.name))
         records = {path.stem: path for path in found}
         if names and records:

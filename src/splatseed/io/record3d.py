@@ -30,11 +30,10 @@ from jaxtyping import Float64
 from PIL import Image as PilImage
 
 from splatseed.camera import rotation_from_quat
-from splatseed.errors import MissingDependencyError, SceneFormatError, SceneNotFoundError
+from splatseed.errors import MissingDependencyError, SceneNotFoundError
 from splatseed.findings import Finding
-from splatseed.io.camera_records import check_pose
+from splatseed.io.camera_records import check_pose, check_unit_quat
 from splatseed.io.depth_maps import DepthFiles, find_confidences
-from splatseed.io.extraction import extracted
 from splatseed.io.files import (
     COPY_AGAIN,
     StrPath,
@@ -43,8 +42,8 @@ from splatseed.io.files import (
     translate_errors,
     translate_read_errors,
 )
-from splatseed.io.film import choose_photographs
 from splatseed.io.phone import PhoneFrame, read_phone_scene
+from splatseed.io.recordings import choose_photographs, chosen_finding, extracted
 from splatseed.progress import Progress
 from splatseed.requirements import require
 from splatseed.runtime.fingerprint import fingerprint
@@ -55,8 +54,6 @@ ARCHIVE = ".r3d"
 """The suffix of Record3D's archives."""
 _EXPORT = "EXR_RGBD"
 _PHOTOGRAPH = re.compile(r"(\d{1,9})\.(jpe?g|png)", re.IGNORECASE)
-_NORM_SLACK = 0.01
-"""Largest plausible error of a quaternion's length."""
 _MAX_MEMBER = 1 << 28
 """Bytes of the largest plausible photograph or map in an archive."""
 _FIX = 'In the app, export the recording again, as "EXR + RGB" or as .r3d.'
@@ -100,13 +97,7 @@ def is_rgbd_video(path: Path) -> bool:
 
 
 def read_record3d(folder: StrPath) -> Scene:
-    """Read an export's folder or an unpacked archive, with its depth maps; the cloud is empty.
-
-    Raises:
-        SceneNotFoundError: There are no metadata, or there is no photograph.
-        SceneFormatError: The metadata are malformed.
-        OutputError: The cache, into which the maps of an archive are extracted, cannot be written.
-    """
+    """Read an export's folder or an unpacked archive, with its depth maps; the cloud is empty."""
     found = _find(Path(folder))
     assert found is not None  # noqa: S101  (is_record3d)
     root, layout = found
@@ -131,13 +122,7 @@ def read_record3d(folder: StrPath) -> Scene:
 
 
 def read_r3d(path: StrPath) -> Scene:
-    """Read an archive, whose photographs and depth maps are extracted into the user's cache.
-
-    Raises:
-        SceneNotFoundError: There is no such file, or no photograph in it.
-        SceneFormatError: It is no archive of Record3D, or damaged.
-        OutputError: The cache cannot be written.
-    """
+    """Read an archive, whose photographs and depth maps are extracted into the user's cache."""
     path = Path(path)
     with _opened(path) as archive, translate_errors(path, "an archive of Record3D"):
         data = _read_within(archive, _R3D.metadata)
@@ -193,7 +178,6 @@ def _scene(
 
 
 def _lacking(package: str) -> list[Finding]:
-    """Report that a package is not installed which depth maps need."""
     try:
         require(package)
     except MissingDependencyError as error:
@@ -203,7 +187,6 @@ def _lacking(package: str) -> list[Finding]:
 
 
 def _number(name: str) -> int:
-    """Return the number of a photograph's pose."""
     return int(Path(name).stem)
 
 
@@ -222,20 +205,12 @@ class _Metadata:
     pinholes: Float64[np.ndarray, "M 4"]  # of the first M frames, if stored
 
     def frame(self, name: str) -> PhoneFrame:
-        """Return a photograph's camera and pose.
-
-        Raises:
-            NotFiniteError: The pose is not finite, or zero.
-            SceneFormatError: The quaternion is not of length 1.
-        """
+        """Return a photograph's camera and pose."""
         number = _number(name)
         where = f"{self.path}, pose {number}"
         quat, center = self.poses[number, [3, 0, 1, 2]], self.poses[number, 4:]
         check_pose((*quat, *center), f"of {name}", where)
-        if abs(np.linalg.norm(quat) - 1) > _NORM_SLACK:
-            numbers = " ".join(f"{each:g}" for each in self.poses[number])
-            expected = f"a quaternion of length 1, then a position, in {where}"
-            raise SceneFormatError(expected, found=numbers, fix=_FIX)
+        check_unit_quat(quat, where, _FIX)
         pose = np.column_stack([rotation_from_quat(quat), center])
         stored = self.pinholes[number].tolist() if number < len(self.pinholes) else self.pinhole
         fx, fy, cx, cy = map(float, stored)
@@ -279,10 +254,7 @@ def _choose(
 ) -> tuple[list[str], list[Finding]]:
     """Return the photographs to use in order of their numbers, and findings about the others.
 
-    Args:
-        metadata: The recording's.
-        sizes: Bytes of the files beside the photographs, and of these, by name.
-        where: The recording.
+    ``sizes`` are bytes of the files beside the photographs, and of these, by name.
     """
     found = {_number(name): name for name in sorted(sizes) if _PHOTOGRAPH.fullmatch(name)}
     posed = [number for number in sorted(found) if number < len(metadata.poses)]
@@ -307,9 +279,7 @@ def _choose(
     focal = metadata.pinhole[0] / metadata.size[0]
     chosen = choose_photographs(details, rotations.reshape(-1, 3, 3), centers[usable], focal)
     if len(chosen) < len(known):
-        which = "the sharpest at equal distances of the camera's motion"
-        text = f"{len(chosen):,} of {len(known):,} photographs are used: {which}."
-        findings.append(Finding("chosen-photographs", text, "info"))
+        findings.append(chosen_finding(f"{len(chosen):,} of {len(known):,} photographs"))
         posed = [known[index] for index in chosen.tolist()]
     return [found[number] for number in posed], findings
 
@@ -322,7 +292,6 @@ _Read = Callable[[str], bytes | None]
 
 @contextmanager
 def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
-    """Open an archive; raises as ``read_r3d``."""
     with translate_read_errors(path):
         file = open_file(path)
     with file:
@@ -361,13 +330,8 @@ def _unpack(
 ) -> tuple[Path, list[Finding]]:
     """Extract some photographs and their maps; return the folder, and a finding if maps lack.
 
-    Args:
-        source: The archive.
-        facts: Identifies its content.
-        metadata: The archive's.
-        names: The photographs.
-        read: Reads a member.
-        photographs: Extract photographs as well, not their maps alone.
+    ``facts`` identify the content of the archive ``source``; without ``photographs``, the maps
+    alone are extracted.
     """
     lacking = _lacking("lzfse")
 

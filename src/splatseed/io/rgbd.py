@@ -21,21 +21,22 @@ from splatseed.camera import Intrinsics, rotation_from_quat
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.findings import Finding
 from splatseed.io import depth_maps
-from splatseed.io.camera_records import make_intrinsics, rigid_pose
-from splatseed.io.files import StrPath, numbered_lines, read_json, translate_errors
+from splatseed.io.camera_records import check_unit_quat, left_out, make_intrinsics, rigid_pose
+from splatseed.io.files import StrPath, is_data, numbered_lines, read_json, translate_errors
 from splatseed.io.origin import recentered
 from splatseed.io.photograph import lens_findings
 from splatseed.io.photograph_checks import photograph_size
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import OPENCV, Image, Scene, SceneSource
-from splatseed.text import agreeing, counted
 
 _FRAME = re.compile(r"frame(\d+)\.(?:jpe?g|png)", re.IGNORECASE)
 _TOLERANCE = 0.02
 """Largest difference in time between an image and its depth map or pose, seconds."""
-_NORM_SLACK = 0.01  # of a quaternion with four digits
 _DEPTH_SCALE = 5000.0
 """TUM's stored units per metre."""
+_WXYZ = [7, 4, 5, 6]
+"""Columns of a quaternion in ``groundtruth.txt``."""
+_FIX = "Correct the line."
 _SIZE = (640, 480)
 _SERIES = re.compile(r"(?:freiburg|(?<![a-z])fr)_?([123])(?!\d)", re.IGNORECASE)
 _COLOR_CAMERAS: dict[str, tuple[float, ...]] = {
@@ -89,13 +90,8 @@ def load_rgbd(root: StrPath) -> Scene:
         _check_image(frames[i], intrinsics)
         images.append(Image(frames[i].name, i + 1, intrinsics, quat, translation))
     lost = [frames[i].name for i in np.flatnonzero(~tracked)]
-    scene = _scene(
-        track,
-        folder,
-        images,
-        intrinsics,
-        *_left_out("missing-poses", "frame", "a finite pose", lost),
-    )
+    findings = left_out("missing-poses", "frame", "a finite pose", lost)
+    scene = _scene(track, folder, images, intrinsics, *findings)
     return scene.replace(depths=depth_maps.match_by_name(scene, folder))
 
 
@@ -144,9 +140,9 @@ def load_tum(root: StrPath) -> Scene:
         images.append(Image(name, i + 1, intrinsics, quat, translation))
     lost = [names[i] for i in np.flatnonzero(~near)]
     missing = [names[i] for i in np.flatnonzero(near & ~present)]
-    left_out = _left_out("missing-poses", "image", "a pose close in time", lost)
-    left_out += _left_out("missing-photographs", "image", "a file", missing)
-    findings = (*guessed, *left_out, *lens_findings(images))
+    findings = [*guessed, *left_out("missing-poses", "image", "a pose close in time", lost)]
+    findings += left_out("missing-photographs", "image", "a file", missing)
+    findings += lens_findings(images)
     scene = _scene(track, root / folder, images, intrinsics, *findings)
     return scene.replace(depths=find_tum_depths(scene, root))
 
@@ -218,7 +214,6 @@ def _read_intrinsics(path: Path) -> Intrinsics:
 
 
 def _check_image(path: Path, intrinsics: Intrinsics) -> None:
-    """Check that an image has the size of its camera; only its header is read."""
     expected = (intrinsics.width, intrinsics.height)
     size = photograph_size(path)
     if size != expected:
@@ -229,17 +224,7 @@ def _check_image(path: Path, intrinsics: Intrinsics) -> None:
         )
 
 
-def _left_out(kind: str, noun: str, lacking: str, names: Sequence[str]) -> tuple[Finding, ...]:
-    are = agreeing(len(names), "is", "are")
-    subject = f"{counted(len(names), noun)} without {lacking}"
-    if not names:
-        return ()
-    text = f"{subject} {are} left out, such as {names[0]}."
-    return (Finding(kind, text, subjects=tuple(names)),)
-
-
 def _read_list(path: Path) -> tuple[Float64[np.ndarray, " N"], tuple[str, ...]]:
-    """Read times and relative paths of ``rgb.txt`` or ``depth.txt``, sorted by time."""
     records = []
     for where, fields in _records(path, 2):
         name = PurePosixPath(fields[1].replace("\\", "/"))
@@ -261,10 +246,9 @@ def _read_track(path: Path) -> Float64[np.ndarray, "M 8"]:
         row = _numbers(where, fields)
         if not np.isfinite(row).all():
             continue
-        if abs(np.linalg.norm(row[4:]) - 1) > _NORM_SLACK:
-            raise _bad(where, "a quaternion of length 1", " ".join(fields[4:]))
+        check_unit_quat(np.array(row)[_WXYZ], where, _FIX)
         rows.append(row)
-    table = np.array(sorted(rows), np.float64).reshape(-1, 8)[:, [0, 1, 2, 3, 7, 4, 5, 6]]
+    table = np.array(sorted(rows), np.float64).reshape(-1, 8)[:, [0, 1, 2, 3, *_WXYZ]]
     table[:, 4:] /= np.linalg.norm(table[:, 4:], axis=1, keepdims=True)
     return table
 
@@ -302,9 +286,9 @@ def _poses_at(
 def _records(path: Path, count: int) -> Iterator[tuple[str, list[str]]]:
     """Yield the place and the ``count`` fields of each line that is neither empty nor a comment."""
     for where, line in numbered_lines(path):
-        fields = line.split()
-        if not fields or fields[0].startswith("#"):
+        if not is_data(line):
             continue
+        fields = line.split()
         if len(fields) != count:
             raise _bad(where, f"{count} fields", f"{len(fields)}")
         yield where, fields
@@ -318,4 +302,4 @@ def _numbers(where: str, fields: list[str]) -> list[float]:
 
 
 def _bad(where: str, expected: str, found: str) -> SceneFormatError:
-    return SceneFormatError(f"{expected} in {where}", found=found[:200], fix="Correct the line.")
+    return SceneFormatError(f"{expected} in {where}", found=found[:200], fix=_FIX)

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.findings import Finding
+from splatseed.io.camera_records import left_out
 from splatseed.io.depth_maps import match_by_name
 from splatseed.io.files import StrPath
 from splatseed.io.phone import (
@@ -30,10 +30,11 @@ from splatseed.io.phone import (
     read_matrix,
     read_phone_scene,
     read_record,
+    without_photograph,
 )
 from splatseed.io.photograph_checks import Size, photograph_size
 from splatseed.scene import Scene
-from splatseed.text import agreeing, counted
+from splatseed.text import counted
 
 _RECORD = re.compile(r"frame_\d{5,}\.json")
 _PHOTOGRAPH = re.compile(r"frame_\d{5,}\.(?:jpe?g|png)", re.IGNORECASE)
@@ -56,12 +57,7 @@ def is_photograph(name: str) -> bool:
 
 
 def read_scanner_app(root: StrPath) -> Scene:
-    """Read the frames that have a photograph, with their depth maps; the cloud is empty.
-
-    Raises:
-        SceneNotFoundError: No frame has a photograph.
-        SceneFormatError: A record is malformed.
-    """
+    """Read the frames that have a photograph, with their depth maps; the cloud is empty."""
     root = Path(root)
     names = sorted(path.name for path in root.iterdir())
     records = {Path(name).stem: root / name for name in names if _RECORD.fullmatch(name)}
@@ -74,16 +70,9 @@ def read_scanner_app(root: StrPath) -> Scene:
             found=f"none for {counted(len(records), 'frame')}",
             fix='In the app, share the scan as "All Data" and pass the folder in the archive.',
         )
-    findings = []
-    if lacking := len(records) - len(used):
-        have = agreeing(lacking, "has no photograph and is", "have no photograph and are")
-        text = f"{lacking} of {counted(len(records), 'frame')} {have} left out."
-        findings.append(Finding("missing-photographs", text))
-    if lost := [name for stem, name in photographs.items() if stem not in records]:
-        are = agreeing(len(lost), "is", "are")
-        subject = f"{counted(len(lost), 'photograph')} without a pose (a .json beside it)"
-        text = f"{subject} {are} left out, such as {lost[0]}."
-        findings.append(Finding("missing-poses", text, subjects=tuple(lost)))
+    findings = without_photograph(len(records) - len(used), len(records), "frame")
+    lost = [name for stem, name in photographs.items() if stem not in records]
+    findings += left_out("missing-poses", "photograph", "a pose (a .json beside it)", lost)
 
     def read(name: str) -> PhoneFrame:
         return _read_frame(records[Path(name).stem], photograph_size(root / name))

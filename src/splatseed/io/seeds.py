@@ -1,10 +1,12 @@
-"""``seeds.npz``: origin and attributes of a scene's points, which point files have no field for.
+"""What an output records of its scene that the layout's files do not: ``seeds.npz`` and manifest.
 
-It holds, in the order of the points, ``source`` uint8 [N] if any point was added, ``normals``
-float16 [N, 3], ``sizes`` float32 [N] and ``confidence`` float16 [N] where known for any point, and
-a ``digest`` of the positions. ``source`` is the only record of a point's origin: without it all
+``seeds.npz`` has the origin and attributes of points, which point files have no field for. It
+holds, in the order of the points, ``source`` uint8 [N] if any point was added, ``normals`` float16
+[N, 3], ``sizes`` float32 [N] and ``confidence`` float16 [N] where known for any point, and a
+``digest`` of the positions. ``source`` is the only record of a point's origin: without it all
 points are originals; counts in ``splatseed.json`` are for people. A file that is damaged or belongs
-to other points is ignored with a warning.
+to other points is ignored with a warning. The manifest records absent images and masks, without
+which the scene would be read with other test views, or with masks that it does not use.
 """
 
 from __future__ import annotations
@@ -22,11 +24,11 @@ from jaxtyping import Float32
 from splatseed.errors import PointCloudError
 from splatseed.findings import Finding
 from splatseed.io.files import ARCHIVE_FAILURES, read_npy
-from splatseed.io.recorded import facts_for_reading
+from splatseed.io.masks import with_own_masks
 from splatseed.io.staging import MANIFEST, read_manifest, write_json
 from splatseed.pointcloud import ATTRIBUTES, ORIGINAL, PointCloud
 from splatseed.runtime.fingerprint import fingerprint
-from splatseed.scene import Scene
+from splatseed.scene import Masks, Scene
 
 SEEDS = "seeds.npz"
 UPSAMPLED = "upsampled"
@@ -43,6 +45,12 @@ _STORED: dict[str, tuple[tuple[int, ...], np.dtype[Any]]] = {
 """Shape of one point's value, and type in the file."""
 _DIGEST_BYTES = 16
 _IGNORED = "seeds-file-ignored"  # the kind of finding
+_ABSENT = "absent"
+"""The manifest's key for ``Scene.absent``."""
+_TRANSPARENT, _BLACK = "transparent", "black"
+"""The manifest's entry for masks without ``Masks.alpha``."""
+_MASKED, _NOTHING = "masks", "none"
+"""The manifest's entry for a scene without masks, whatever lies near its photographs."""
 
 
 def _position_digest(xyz: Float32[np.ndarray, "n 3"]) -> bytes:
@@ -99,9 +107,8 @@ def saw_all_photographs(scene: Scene) -> bool:
     """Whether ``splatseed upsample`` made new points from photographs and held none out."""
     facts = _upsampling(scene) or {}
     try:
-        parameters = facts["parameters"]  # splatseed 0.3 wrote hold_out
-        test_every = parameters.get("test_every", parameters.get("hold_out"))
-        all_used = test_every == 0 and not facts.get("listed_tests_held_out")
+        all_used = facts["parameters"].get("test_every") == 0
+        all_used = all_used and not facts.get("listed_tests_held_out")
         return bool(facts["num_new"]) and all_used
     except (TypeError, KeyError, AttributeError):
         return False  # not made from photographs
@@ -121,7 +128,6 @@ def carry_seeds(scene: Scene, written: Path, folder: Path) -> None:
 def _read_seeds(
     folder: Path, points: PointCloud
 ) -> tuple[dict[str, np.ndarray], tuple[Finding, ...]]:
-    """What ``seeds.npz`` says about the points read from a folder, or why it was ignored."""
     path = folder / SEEDS
     try:
         if not path.is_file():
@@ -154,3 +160,37 @@ def _member(
     if (array.shape, array.dtype) != (shape, dtype):
         raise ValueError(name)
     return array
+
+
+# Entries of the manifest --------------------------------------------------------------------------
+
+
+def facts_for_reading(scene: Scene) -> dict[str, Any]:
+    """Return entries of an output's manifest by which ``load_scene`` reads it as this scene."""
+    facts: dict[str, Any] = {}
+    if scene.absent:  # so that the others train or test as before
+        facts[_ABSENT] = list(scene.absent)
+    if scene.masks is None and scene.source.image_dir:
+        facts[_MASKED] = _NOTHING  # else masks near the photographs would count again
+    if scene.masks and not scene.masks.alpha:  # else transparent pixels would be masked
+        facts[_TRANSPARENT] = _BLACK
+    return facts
+
+
+def restore_absent(scene: Scene) -> Scene:
+    """Add the absent images that the manifest of a scene lists."""
+    noted = read_manifest(scene.source.root).get(_ABSENT)
+    if not isinstance(noted, list) or not all(isinstance(name, str) for name in noted):
+        return scene
+    known = {*scene.absent, *(image.name for image in scene.images)}
+    return scene.replace(absent=(*scene.absent, *(name for name in noted if name not in known)))
+
+
+def with_recorded_masks(scene: Scene) -> Scene:
+    """Attach the masks near the photographs, as far as the manifest of a scene lets them count."""
+    manifest = read_manifest(scene.source.root)
+    if manifest.get(_MASKED) == _NOTHING:
+        return scene.replace(masks=None)
+    if manifest.get(_TRANSPARENT) == _BLACK:  # of a Blender pair
+        scene = scene.replace(masks=replace(scene.masks or Masks({}), alpha=False))
+    return with_own_masks(scene)

@@ -7,12 +7,11 @@ line, as in nerfstudio's COLMAP reader, graphdeco (beside the model) and others.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
 from splatseed.findings import Finding
-from splatseed.io.files import read_bytes
+from splatseed.io.files import read_bytes, read_json
 from splatseed.scene import Scene, Split
 from splatseed.text import agreeing, counted
 
@@ -52,7 +51,7 @@ def _lists(scene: Scene) -> Iterator[tuple[str, list[list[str]]]]:
     """Yield each list's description, and its names for training, test and maybe validation."""
     source = scene.source
     if source.transforms_path is not None:
-        fields = json.loads(read_bytes(source.transforms_path))
+        fields = read_json(source.transforms_path)
         found = [fields.get(f"{part}_filenames") for part in ("train", "test", "val")]
         parts = [[n for n in f if isinstance(n, str)] if isinstance(f, list) else [] for f in found]
         if any(parts):

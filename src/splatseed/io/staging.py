@@ -268,7 +268,6 @@ def _check_replaceable(target: Path, kind: str, *, overwrite: bool) -> None:
 
 
 def _listed(folder: Path) -> set[str]:
-    """Return the entries of a folder's manifest."""
     files = read_manifest(folder).get("files")
     return {name for name in files if isinstance(name, str)} if isinstance(files, list) else set()
 

@@ -25,14 +25,22 @@ from jaxtyping import Bool, Float64
 from splatseed.camera import rotation_from_quat
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.findings import Finding
-from splatseed.io.camera_records import check_pose
+from splatseed.io.camera_records import OPENCV_FROM_OPENGL, check_pose, check_unit_quat
 from splatseed.io.depth_maps import DepthFiles, find_confidences
-from splatseed.io.extraction import extracted, identity
 from splatseed.io.files import COPY_AGAIN, StrPath, numbered_lines, read_json
-from splatseed.io.film import FILM, choose_frames, pose_motion
 from splatseed.io.phone import HALF_PIXEL, PhoneFrame, read_phone_scene
 from splatseed.io.photograph_checks import photograph_size
-from splatseed.io.video import sharpness, small_frames, write_frames
+from splatseed.io.recordings import (
+    FILM,
+    choose_frames,
+    chosen_finding,
+    extracted,
+    identity,
+    pose_motion,
+    sharpness,
+    small_frames,
+    write_frames,
+)
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.text import counted
@@ -40,11 +48,8 @@ from splatseed.text import counted
 VIDEO, ODOMETRY, CAMERA = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _PINHOLE = ("fx", "fy", "cx", "cy")
-_NORM_SLACK = 0.01
-"""Largest plausible error of a quaternion's length."""
 _DEPTH_SCALE = 1000.0
 """Stored units per metre."""
-_OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 _COUNT = "frames.json"
 _FIX = "Export the recording from the app again."
 
@@ -55,14 +60,7 @@ def is_stray(folder: Path) -> bool:
 
 
 def read_stray(root: StrPath) -> Scene:
-    """Read the sharpest frames, evenly spaced by motion, with their depth maps; without points.
-
-    Raises:
-        SceneNotFoundError: A file is missing.
-        SceneFormatError: A file is malformed, or the video has not a frame per pose.
-        MissingDependencyError: imageio-ffmpeg is not installed.
-        OutputError: The cache cannot be written.
-    """
+    """Read the sharpest frames, evenly spaced by motion, with their depth maps; without points."""
     root = Path(root)
     for name, holds in ((ODOMETRY, "the poses"), (VIDEO, "the photographs")):
         if not (root / name).is_file():
@@ -102,20 +100,12 @@ class _Track:
         return np.asarray(np.isfinite(self.poses).all(axis=1) & self.poses[:, 3:].any(axis=1))
 
     def frame(self, index: int, size: tuple[int, int]) -> PhoneFrame:
-        """Return the camera and pose of a frame of the video.
-
-        Raises:
-            NotFiniteError: The pose is not finite, or zero.
-            SceneFormatError: The quaternion is not of length 1.
-        """
+        """Return the camera and pose of a frame of the video."""
         where, pose = self.lines[index], self.poses[index]
         quat, center = pose[[6, 3, 4, 5]], pose[:3]
         check_pose((*quat, *center), "of a frame", where)
-        if abs(np.linalg.norm(quat) - 1) > _NORM_SLACK:
-            found = " ".join(f"{each:g}" for each in quat[[1, 2, 3, 0]])
-            expected = f"qx qy qz qw of length 1 in {where}"
-            raise SceneFormatError(expected, found=found, fix=_FIX)
-        rotation = rotation_from_quat(quat) @ _OPENGL_FROM_OPENCV
+        check_unit_quat(quat, where, _FIX)
+        rotation = rotation_from_quat(quat) @ OPENCV_FROM_OPENGL[:3, :3]  # its own inverse
         fx, fy, cx, cy = self.pinholes[index].tolist()
         pinhole = (fx, fy, cx + HALF_PIXEL, cy + HALF_PIXEL)
         return PhoneFrame(where, size, pinhole, np.column_stack([rotation, center]))
@@ -195,7 +185,6 @@ def _extract(video: Path, track: _Track) -> Path:
 
 
 def _first_line(video: Path, track: _Track, total: int) -> int:
-    """Return the index of the line that belongs to the first frame of the video."""
     num_poses = len(track.poses)
     if total >= num_poses:
         return 0
@@ -211,9 +200,7 @@ def _first_line(video: Path, track: _Track, total: int) -> int:
 def _findings(track: _Track, used: int, total: int) -> list[Finding]:
     findings = []
     if used < min(total, len(track.poses)):
-        which = "the sharpest at equal distances of the camera's motion"
-        text = f"{used:,} of the {total:,} frames of {VIDEO} are used: {which}."
-        findings.append(Finding("chosen-photographs", text, "info"))
+        findings.append(chosen_finding(f"{used:,} of the {total:,} frames of {VIDEO}"))
     if total != len(track.poses):
         frames, lines = counted(total, "frame"), counted(len(track.poses), "pose")
         first = "the first pose has none" if total < len(track.poses) else "the last have no pose"

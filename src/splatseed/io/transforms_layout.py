@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Collection, Mapping, Sequence
@@ -16,7 +15,9 @@ from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.errors import OutputError
 from splatseed.findings import Finding
 from splatseed.io import nerfstudio
+from splatseed.io.camera_records import OPENCV_FROM_OPENGL
 from splatseed.io.colmap_layout import Written, without_zero_distortion, write_colmap_layout
+from splatseed.io.files import absolute, read_json
 from splatseed.io.frame_files import Found, FrameFiles
 from splatseed.io.image_folders import (
     copy_files,
@@ -131,7 +132,6 @@ def _write(scene: Scene, folder: Path, plan: _Plan, layout: Layout) -> Written:
 
 
 def _new_json(scene: Scene, A: Float64[np.ndarray, "3 4"] | None) -> dict[str, Any]:
-    """Make the content of a new ``transforms.json``, with poses transformed by A."""
     used = {image.intrinsics.camera_id: image.intrinsics for image in scene.images}
     cameras = {camera_id: _camera_fields(camera) for camera_id, camera in used.items()}
     models = sorted({fields["camera_model"] for fields in cameras.values()})
@@ -146,7 +146,7 @@ def _new_json(scene: Scene, A: Float64[np.ndarray, "3 4"] | None) -> dict[str, A
         shared = {"camera_model": shared.get("camera_model", "OPENCV")}
     frames = []
     for image in scene.images:
-        pose = image.camera.world_from_cam @ nerfstudio.OPENCV_FROM_OPENGL
+        pose = image.camera.world_from_cam @ OPENCV_FROM_OPENGL
         if A is not None:
             pose[:3] = A @ pose
         own = {} if len(used) == 1 else cameras[image.intrinsics.camera_id]
@@ -162,7 +162,6 @@ def _new_json(scene: Scene, A: Float64[np.ndarray, "3 4"] | None) -> dict[str, A
 
 
 def _camera_fields(camera: Intrinsics) -> dict[str, Any]:
-    """Return a camera record's fields by nerfstudio's names."""
     camera = without_zero_distortion(camera)
     model = _MODELS.get(camera.model)
     if model is None:
@@ -172,9 +171,8 @@ def _camera_fields(camera: Intrinsics) -> dict[str, Any]:
             fix="Undistort the scene first (splatseed undistort), or write the COLMAP layout.",
         )
     terms = camera.params[CAMERA_MODELS[camera.model].num_focal + 2 :]
-    matrix = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     fields = {"camera_model": model, "w": camera.width, "h": camera.height}
-    fields |= zip(_FIELDS[2:], matrix, strict=True)
+    fields |= zip(_FIELDS[2:], camera.pinhole.params, strict=True)
     return fields | dict(zip(_TERMS[model], (*terms, 0.0, 0.0, 0.0, 0.0), strict=False))
 
 
@@ -191,11 +189,11 @@ def _kept_json(transforms: nerfstudio.Transforms, names: Collection[str]) -> dic
         """Return a path to the same file from another folder of this computer."""
         if not isinstance(path, str):
             return path
-        file, plain = there.get(path), Path(os.path.abspath(root / path))  # noqa: PTH100
+        file, plain = there.get(path), absolute(root / path)
         if file and file.path != plain:  # without its suffix, say, which nerfstudio needs
             path = Path(os.path.relpath(file.path, root)).as_posix()
         if os.path.normpath(path).startswith(".."):
-            return os.path.abspath(root / path)  # noqa: PTH100  (resolve would follow links)
+            return str(absolute(root / path))
         return path
 
     frames: dict[bool, list[dict[str, Any]]] = {False: [], True: []}
@@ -223,7 +221,6 @@ def _kept_json(transforms: nerfstudio.Transforms, names: Collection[str]) -> dic
 
 
 def _named(transforms: nerfstudio.Transforms, key: str) -> list[str]:
-    """List the files that the frames name under a key."""
     names = (frame.fields.get(key) for frame in transforms.frames)
     return [name for name in names if isinstance(name, str)]
 
@@ -234,7 +231,7 @@ def _missing_fields(fields: Mapping[str, Any], camera: Intrinsics) -> dict[str, 
     nerfstudio and OpenSplat need them, and ``camera_model``, where others take ``camera_angle_x``
     and the middle of the photograph.
     """
-    values = camera.width, camera.height, *camera.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    values = camera.width, camera.height, *camera.pinhole.params
     known = dict(zip(_FIELDS, values, strict=True))
     return {name: value for name, value in known.items() if fields.get(name) is None}
 
@@ -276,7 +273,7 @@ def rewrites_masks(scene: Scene, layout: Layout) -> bool:
 def forget_masks(folder: Path) -> None:
     """Name no masks in an output's ``transforms.json``, as it has none."""
     path = folder / "transforms.json"
-    content = json.loads(path.read_text("utf-8"))
+    content = read_json(path)
     _drop_mask_paths(content)
     write_json(path, content)
 
@@ -287,7 +284,6 @@ def _drop_mask_paths(content: Mapping[str, Any]) -> None:
 
 
 def _names_masks(source: SceneSource) -> bool:
-    """Whether the scene's own ``transforms.json`` names masks."""
     if source.transforms_path is None:
         return False
     frames = nerfstudio.read_transforms(source.transforms_path).frames

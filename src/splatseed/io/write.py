@@ -18,13 +18,13 @@ from splatseed.errors import OutputError, PointCloudError
 from splatseed.findings import Finding
 from splatseed.io.cleaning import clean_scene
 from splatseed.io.colmap_layout import write_colmap_layout
-from splatseed.io.extraction import is_extracted
 from splatseed.io.files import StrPath
 from splatseed.io.image_folders import link_folders, photographs_hidden
 from splatseed.io.mask_files import FOLDER as MASKS
 from splatseed.io.masks import write_masks
 from splatseed.io.origin import write_offset
-from splatseed.io.recorded import facts_for_reading
+from splatseed.io.recordings import is_extracted
+from splatseed.io.seeds import facts_for_reading
 from splatseed.io.staging import MANIFEST, output_folder, write_json
 from splatseed.io.transforms_layout import (
     Layout,

@@ -20,10 +20,10 @@ from platformdirs import user_cache_path
 
 from splatseed.camera import Camera
 from splatseed.errors import OutputError, ParameterError, SceneFormatError, SceneNotFoundError
-from splatseed.io.bit_depth import WHITE
 from splatseed.io.files import ARCHIVE_FAILURES, StrPath, read_npy
 from splatseed.io.photograph import decode_photograph, photograph_bytes, photograph_folder
 from splatseed.io.photograph_checks import check_sizes
+from splatseed.io.picture import WHITE
 from splatseed.io.staging import atomic_file
 from splatseed.lens import undistort_advice
 from splatseed.photos.sizes import check_side

@@ -21,9 +21,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
-from splatseed.io.bit_depth import WHITE, find_white, is_16_bit
 from splatseed.io.files import VIDEO_SUFFIXES, StrPath, files_below
-from splatseed.io.film import choose_frames
 from splatseed.io.image_folders import link_folders
 from splatseed.io.mask_files import masks_among
 from splatseed.io.photograph import (
@@ -34,9 +32,16 @@ from splatseed.io.photograph import (
     photograph_bytes,
 )
 from splatseed.io.photograph_checks import check_sizes
+from splatseed.io.picture import WHITE, find_white, is_16_bit
+from splatseed.io.recordings import (
+    ANALYSIS_WIDTH,
+    choose_frames,
+    sharpness,
+    small_frames,
+    write_frames,
+)
 from splatseed.io.scanner_app import is_photograph, is_scanner_app
 from splatseed.io.staging import read_manifest
-from splatseed.io.video import ANALYSIS_WIDTH, sharpness, small_frames, write_frames
 from splatseed.photos.sizes import at_file_size
 from splatseed.progress import Progress, silent
 from splatseed.runtime.fingerprint import fingerprint

@@ -22,18 +22,18 @@ from splatseed import errors
 from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.findings import Finding
 from splatseed.io import write_scene
-from splatseed.io.bit_depth import find_white
 from splatseed.io.colmap_layout import write_split
 from splatseed.io.colmap_model import read_model_cameras
+from splatseed.io.depth_maps import write_lenses
 from splatseed.io.files import StrPath
 from splatseed.io.mask_files import FOLDER as MASKS
 from splatseed.io.masks import write_masks
 from splatseed.io.origin import write_offset
 from splatseed.io.photograph import photograph_folder
 from splatseed.io.photograph_checks import check_sizes, with_photographs
+from splatseed.io.picture import find_white
 from splatseed.io.seeds import carry_seeds
 from splatseed.io.staging import MANIFEST, output_folder, write_json
-from splatseed.io.undistorted import write_lenses
 from splatseed.photos.sizes import at_file_size
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Note, Progress, silent, silent_note

@@ -20,6 +20,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from splatseed.camera import Camera
 from splatseed.errors import OutputError, ParameterError, SceneFormatError
+from splatseed.io.camera_records import OPENCV_FROM_OPENGL
 from splatseed.io.files import read_bytes, read_json, translate_errors
 from splatseed.io.staging import atomic_file
 from splatseed.photos.upright import up_direction
@@ -38,7 +39,6 @@ from splatseed.text import counted, numeric_order
 from splatseed.viewer.models import CORE, pinhole_view, split_picture
 from splatseed.viewer.page import depth_picture, nearness, value_range
 
-OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 MAX_FRAMES = 100_000
 DEFAULT_SIZE = (960, 720)
 """Width and height without cameras."""

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from splatseed.commands.outputs import check_free
-from splatseed.commands.upsample import previews, report
-from splatseed.commands.upsample.cloud import load_cloud
+import numpy as np
+from jaxtyping import Float64
+
+from splatseed.commands.options import check_free
+from splatseed.commands.upsample import report
 from splatseed.commands.upsample.options import CLOUD, Options, check, parse
 from splatseed.console import OUT, StageClock, print_note, stage_display
 from splatseed.findings import Finding
@@ -17,16 +20,38 @@ from splatseed.io.clouds import open_cloud
 from splatseed.io.colmap_model import scene_root
 from splatseed.io.load import with_depths_in, with_own_depths
 from splatseed.io.masks import with_masks
-from splatseed.io.origin import RECENTER, format_offset, middle_of_cameras, translated
-from splatseed.io.staging import check_output
+from splatseed.io.nerfstudio import read_cloud_transform
+from splatseed.io.origin import (
+    RECENTER,
+    find_shift,
+    format_offset,
+    middle_of_cameras,
+    translated,
+    write_offset,
+)
+from splatseed.io.staging import add_files, check_output, write_json
 from splatseed.methods import Upsampler, configure, number_of_new, planned_size, traits_of
 from splatseed.photos.camera_check import stray_cameras
-from splatseed.progress import Note
+from splatseed.progress import Note, Progress
+from splatseed.runtime.memory import format_bytes
 from splatseed.scene import Scene
 from splatseed.seeding import photo_methods
 from splatseed.seeding.advice import DEFAULT_METHOD, method_for
 from splatseed.seeding.budget import describe_rho, points_within
+from splatseed.similarity import Similarity
+from splatseed.splat.formats import write_gaussians
 from splatseed.text import counted, visible
+from splatseed.training.initialization import gaussians_of_scene
+from splatseed.training.settings import TrainSettings
+
+if TYPE_CHECKING:  # Numba comes with them
+    from splatseed.seeding.clouds.align import CloudAlignment
+    from splatseed.seeding.clouds.method import Cloud, GivenClouds
+
+SAMPLE = 10_000
+"""Points read from a file to tell whether its coordinates include the scene's offset."""
+CLOSE = 0.01
+"""Residual at the middle of the picture's colour scale, relative to the cloud's extent."""
 
 
 def run(arguments: list[str]) -> None:
@@ -102,8 +127,7 @@ def _upsample(options: Options, methods: dict[str, Any], arguments: list[str]) -
         notes.append(Finding("gaussians-written", text, "info"))
     origins = report.origin_counts(seeds, options.method, written.num_points)
     report.summarise(options, scene, replaced, origins, written, seconds, quality, arguments)
-    for finding in notes:
-        print_note(finding)
+    print_note(*notes)
 
 
 def _keep_or_announce(notes: list[Finding], clock: StageClock) -> Note:
@@ -144,9 +168,9 @@ def _write_extras(
     """Write initial Gaussians and pictures, if requested, once the scene is written."""
     try:
         if options.gaussians is not None:
-            previews.write_start(options.gaussians, seeded, method, clock)
+            _write_start(options.gaussians, seeded, method, clock)
         if options.preview:
-            previews.write_previews(options, scene, seeded.points, method, clock)
+            report.write_previews(options, scene, seeded.points, method, clock)
     except KeyboardInterrupt as stop:
         complete = f"The scene in {visible(options.output)} is complete"
         stop.add_note(f"{complete}; its pictures or initial Gaussians may be missing.")
@@ -163,6 +187,18 @@ def _read(options: Options, method: Upsampler) -> Scene:
     return with_own_depths(scene) if options.method == "depth" else scene
 
 
+def _write_start(path: Path, scene: Scene, method: Upsampler, progress: Progress) -> None:
+    """Write the Gaussians that training on the scene's points would start from.
+
+    The test views of the method are not used.
+    """
+    images = photo_methods.photographed(scene, getattr(method, "test_every", 0))
+    views = photo_methods.read_views(scene, images, photo_methods.MAX_SIZE, progress)
+    settings = TrainSettings(strategy="grow", seed_colors=True)
+    write_gaussians(path, gaussians_of_scene(scene.points, views, settings))
+    write_offset(path, scene.offset)
+
+
 def _announce(
     options: Options,
     scene: Scene,
@@ -174,8 +210,7 @@ def _announce(
     """Print the plan, the scene's warnings, and the options that have no effect."""
     name, method = options.method, methods[options.method]
     unused = report.unused_maps(options, scene, method)
-    for finding in (*scene.findings, *stray_cameras(scene), *unused):
-        print_note(finding)
+    print_note(*scene.findings, *stray_cameras(scene), *unused)
     if (listed := scene.listed) is not None and hasattr(method, "test_every"):
         tests = counted(len(listed.test), "test image")
         text = f"{tests} of the scene's {listed.origin} take no part in the seeds."
@@ -205,3 +240,55 @@ def _announce(
         f"seed {options.seed}){memory_note}",
         soft_wrap=True,
     )
+
+
+class LoadedCloud(NamedTuple):
+    """A scene, and the method ``cloud`` whose files are in the scene's frame."""
+
+    scene: Scene
+    method: GivenClouds
+    memory_note: str = ""
+    alignment: CloudAlignment | None = None
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """How well the cloud is aligned, if that was computed."""
+        return () if self.alignment is None else (self.alignment.finding,)
+
+    def write(self, folder: Path) -> None:
+        """Write the alignment's report and picture into the scene folder, if there is one."""
+        if (found := self.alignment) is not None:
+            from splatseed.viewer.clouds import preview_alignment
+
+            add_files(folder, report.ALIGNMENT)
+            written, picture = (folder / name for name in report.ALIGNMENT)
+            write_json(written, found.report)
+            off = found.residuals / (2 * CLOSE * found.extent)
+            preview_alignment(self.scene, found.sample, found.rgb, found.tie_points, off, picture)
+
+
+def load_cloud(options: Options, scene: Scene, method: Cloud, progress: Progress) -> LoadedCloud:
+    """Find the transform of the clouds into the scene's frame, and configure the method with it."""
+    files, memory = options.cloud_files, options.memory_bytes
+    plan = method.of(*files, memory=memory).plan(scene)
+    limit = f"at most {plan.capacity:,} voxels, {format_bytes(plan.memory)} of memory"
+    memory_note = f"\n  -> {', '.join(visible(path) for path in files)}: {limit}"
+    transform = alignment = None
+    if options.cloud_transform is not None:
+        transform = read_cloud_transform(options.cloud_transform, scene)
+        transform = transform.then(Similarity(1.0, np.eye(3), -scene.origin))
+    elif not options.align and (shift := find_shift(scene, _sample(files))).any():
+        transform = Similarity(1.0, np.eye(3), shift)
+    if options.align:
+        from splatseed.seeding.clouds.align import align_cloud
+
+        alignment = align_cloud(scene, files, progress)
+        transform = alignment.scene_from_cloud
+    given = method.of(*files, transform=transform, memory=memory)
+    return LoadedCloud(scene, given, memory_note, alignment)
+
+
+def _sample(files: Sequence[Path]) -> Float64[np.ndarray, "N 3"]:
+    """Return the finite ones among the first points of each file."""
+    firsts = (next(iter(open_cloud(file).chunks(SAMPLE)), None) for file in files)
+    return np.concatenate([np.empty((0, 3)), *(c.xyz[c.finite] for c in firsts if c is not None)])

@@ -1,4 +1,4 @@
-"""Describe and summarise a run of ``splatseed upsample``."""
+"""Describe, summarise and draw a run of ``splatseed upsample``."""
 
 from __future__ import annotations
 
@@ -11,10 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from splatseed.commands.next_steps import print_training
-from splatseed.commands.upsample.cloud import ALIGNMENT
 from splatseed.commands.upsample.options import Options
-from splatseed.commands.upsample.previews import PICTURES
-from splatseed.console import print_note, print_pairs
+from splatseed.console import StageClock, print_note, print_pairs
 from splatseed.depthmap import in_scene_units
 from splatseed.findings import Finding
 from splatseed.io import WriteReport
@@ -28,11 +26,22 @@ from splatseed.methods import (
     source_name,
 )
 from splatseed.pointcloud import ORIGINAL, PointCloud
+from splatseed.progress import silent
+from splatseed.sampling import evenly_spaced
 from splatseed.scene import Scene
 from splatseed.seeding.geometry_score import far_share
-from splatseed.seeding.photo_methods import CELL
+from splatseed.seeding.photo_methods import CELL, MAX_SIZE, Stereo, photographed, read_views
 from splatseed.text import agreeing, counted, quoted
 
+ALIGNMENT = "alignment.json", "preview_alignment.png"
+PAIR, ORIGINS, CELLS, MAPS = PICTURES = (
+    "preview.png",
+    "preview_origins.png",
+    "preview_cells.png",
+    "preview_maps.png",
+)
+PHOTOGRAPHS_SHOWN = 4
+"""Photographs whose cells and maps are drawn."""
 CLOUD_PARAMETERS = {"files", "transform", "memory", "alone"}
 """Parameters of the method cloud that other lines show."""
 MEASURED = {
@@ -252,8 +261,7 @@ def summarise(
         paths = [output / name for name in names if (output / name).is_file()]
         rows += [("" if i else label, str(path)) for i, path in enumerate(paths)]
     print_pairs("splatseed upsample", rows)
-    for note in written.findings:
-        print_note(note)
+    print_note(*written.findings)
     if written.layout == "transforms":
         text = (
             "gsplat's examples, graphdeco's code and LichtFeld need COLMAP's layout, written by: "
@@ -261,3 +269,35 @@ def summarise(
         )
         print_note(Finding("colmap-layout", text, "info"))
     print_training(options.scene, scene, output, written.layout)
+
+
+def write_previews(
+    options: Options, scene: Scene, seeds: PointCloud, method: Upsampler, clock: StageClock
+) -> None:
+    """Draw the points before and after; with photographs, also origins, cells and stereo's maps."""
+    from splatseed.seeding.cover import covered_cells
+    from splatseed.viewer import clouds, maps
+
+    folder = options.output
+    clock("preview", 0.0)
+    clouds.preview_pair(scene, seeds, folder / PAIR, title=options.method)
+    if scene.has_photographs:
+        clock("preview", 0.4)
+        clouds.preview_origins(scene, seeds, folder / ORIGINS, options.method)
+        clock("preview", 0.6)
+        images = photographed(scene)
+        images = tuple(images[i] for i in evenly_spaced(len(images), PHOTOGRAPHS_SHOWN))
+        views = read_views(scene, images, MAX_SIZE, silent)
+        both = [cloud.xyz[cloud.finite] for cloud in (scene.points, seeds)]
+        cells = zip(views, *(covered_cells(views, xyz, CELL) for xyz in both), strict=True)
+        shown = [
+            clouds.CoveredView(v.name, v.photograph, CELL, before, after)
+            for v, before, after in cells
+        ]
+        clouds.preview_cells(shown, folder / CELLS)
+    if isinstance(method, Stereo):
+        # Recomputed for a few views: keeping all maps would take as much memory as the views.
+        count = len(photographed(scene, method.test_every))
+        some = evenly_spaced(count, PHOTOGRAPHS_SHOWN).tolist()
+        maps.preview_maps(scene, method.maps(scene, some, options.seed, clock), folder / MAPS)
+    clock("preview", 1.0)

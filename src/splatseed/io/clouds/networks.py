@@ -160,7 +160,6 @@ class GlbCloud(CloudFile):
 
 
 def _primitives(path: Path, content: Mapping[str, Any], body: int) -> Iterator[_Part]:
-    """Yield the primitives of the scene's nodes; the binary chunk starts at byte ``body``."""
     for mesh, matrix in _placed(content):
         for primitive in content["meshes"][mesh]["primitives"]:
             if "KHR_draco_mesh_compression" in primitive.get("extensions", {}):

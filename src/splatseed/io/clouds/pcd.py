@@ -107,7 +107,6 @@ def _parse_header(data: bytes) -> tuple[np.dtype[Any], int, str, int]:
 def _decompressed(
     path: Path, dtype: np.dtype[Any], rows: int, offset: int
 ) -> dict[str, np.ndarray]:
-    """Decompress a body, which stores one column after another."""
     needed = rows * dtype.itemsize
     fix = "Save the cloud as a binary PCD or PLY, which is read in chunks."
     # Both compressed and decompressed bytes are in memory.

@@ -109,7 +109,6 @@ def _named(lines: Sequence[str], dialect: Dialect, count: int) -> list[str] | No
 
 
 def _guessed(sample: Float64[np.ndarray, "N C"], is_pts: bool) -> list[str]:
-    """Guess column names from values."""
     count = sample.shape[1]
     names = [*XYZ, *(f"column {i + 1}" for i in range(3, count))]
     start = 4 if is_pts and count == 7 else _first_colors(sample)

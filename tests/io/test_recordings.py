@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatseed.io.film import FILM, choose_frames, choose_photographs, pose_motion
+from splatseed.io.recordings import FILM, choose_frames, choose_photographs, pose_motion
 
 
 def turned(degrees):
