@@ -21,7 +21,7 @@ from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scores import CurvePoint, EvalResult
 from splatseed.seeding.budget import RHO, parse_budget
 from splatseed.text import did_you_mean
-from splatseed.training.duration import GROWTH, step_seconds
+from splatseed.training.duration import GAUSSIANS_PER_SEED, step_seconds
 from splatseed.training.settings import Backend, StrategyName, TrainSettings
 from splatseed.training.traits import STRATEGIES
 
@@ -155,7 +155,7 @@ class RunSpec:
         cap = self.settings.cap or math.inf
         num_seeds = self.scene.num_points * (self.arm.ratio or _COST.ratio)
         seeds = min(num_seeds, self.max_seeds or cap)
-        grown = seeds * GROWTH if self.settings.traits.adds else seeds
+        grown = seeds * GAUSSIANS_PER_SEED if self.settings.traits.number_grows else seeds
         if self.arm.strategy == "default-3dgs":
             pixels = self.scene.pixels_at(self.training.factor)
             grown = seeds + _COST.added + _COST.added_per_pixel * pixels

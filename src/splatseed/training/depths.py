@@ -40,8 +40,8 @@ class StereoCost:
     million pixels a second and core. The number for a GPU is an estimate: 150 million pixels
     rendered a second, beside 8 cores; benchmarks/gpu measures both."""
     min_size: int
-    """Minimum side, px. On the CPU it is at least the size that is trained, too; on a GPU that is
-    the photographs' own."""
+    """Minimum side, px. On the CPU the trained size is a minimum, too; not on a GPU, where it is
+    often the photographs' full size."""
 
 
 COSTS: Mapping[str, StereoCost] = MappingProxyType(
@@ -50,8 +50,9 @@ COSTS: Mapping[str, StereoCost] = MappingProxyType(
 MIN_VIEWS = 48
 """Minimum views to compare, if there are as many, however short the run: fewer may not overlap."""
 _PLACING = 0.5
-"""Fraction of this cost that growth needs where it alone compares more than ``MIN_VIEWS``: it gains
-as much as from all of it (benchmarks/tried.md), in up to a fifth less time."""
+"""Fraction of ``StereoCost.pixels`` to spend on maps that only growth uses, if there are more than
+``MIN_VIEWS`` views: it gains as much as from all of it (benchmarks/tried.md), in up to a fifth less
+time."""
 SWEEPS = 2
 """PatchMatch iterations. Two more take 1.6 times as long, find the depth of 1% more of the pixels
 (bonsai, treehill, fox), and gain nothing beyond noise."""
@@ -73,8 +74,8 @@ def stereo_size(
 ) -> int:
     """Return the largest side, px, at which to compare photographs for a run of this length.
 
-    Where training on ``device`` (cpu or cuda) takes much longer than comparing, it is the limit of
-    ``StereoSettings``. ``fraction``: of what stereo may take.
+    At most the ``max_size`` of ``StereoSettings``, which long runs reach. ``device`` is where
+    training runs, cpu or cuda; ``fraction`` scales what stereo may take (``StereoCost``).
     """
     full = StereoSettings().max_size
     if not images:
@@ -94,7 +95,7 @@ def stereo_size(
 def placing_views(
     images: Sequence[Image], settings: TrainSettings, device: str
 ) -> tuple[Sequence[Image], int]:
-    """Select the training photographs to compare for growth, and the largest side, px, to do it at.
+    """Select the training photographs to compare for growth, and their largest side then, px.
 
     As many as a run of this length affords: ``images`` are sorted by name, and the selected ones
     are evenly spaced.

@@ -1,7 +1,7 @@
 """Where to train, and how many Gaussians fit into memory there.
 
-Promise: a requested GPU is used or an error, never silently replaced; a cloud too large to train is
-refused before the first step, with the number that fits, and a growing one is held at what fits.
+Promise: a requested GPU is used, or its absence is an error; more points than memory can hold are
+refused before the first step, with the number that fits; growth stops at that number.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class Capacity:
         """The number at which memory first stopped a run, which then depends on the machine."""
 
     def limit(self, count: int, wanted: int) -> int:
-        """Return up to how many Gaussians ``count`` may grow, if ``wanted`` are wanted."""
+        """Return the number to which ``count`` Gaussians may grow: at most ``wanted``."""
         limit = wanted if self.cap is None else min(self.cap, wanted)
         free = free_bytes(self._device)
         if free is None or limit - count <= free // BYTES_PER_GAUSSIAN:

@@ -13,19 +13,19 @@ from typing import NamedTuple
 from splatseed.training.settings import TrainSettings
 
 COSTS = {"cpu": (5e-3, 0.35e-6, 0.15e-6), "cuda": (8e-3, 5e-9, 2e-9)}
-"""a, b and c: on 2 cores, between a quiet machine with AVX-512 and a busy one with AVX2, on nine
-captures; and on one GPU with 3 million Gaussians. Another machine may be twice as fast or half as
-fast, its proportions differ less."""
+"""a, b and c. On the CPU: of 2 cores, between a quiet machine with AVX-512 and a busy one with AVX2,
+on nine captures; with CUDA: of one GPU with 3 million Gaussians. Another machine may be twice as
+fast or half as fast; the proportions of a, b and c differ less."""
 MEASURED_THREADS = 2
-"""Threads with which the CPU's were measured; a step is split among all."""
-GROWTH = 3.0
+"""Threads with which the CPU's costs were measured; more threads divide the time of a step."""
+GAUSSIANS_PER_SEED = 3.0
 """Gaussians at the end of a run per seed, with densification and without a cap: a guess."""
 HOUR, TOO_LONG = 3600.0, 5400.0
-"""Seconds of the run that is suggested, and of a run beyond which it is suggested."""
+"""Seconds of a suggested run, and seconds above which a shorter run is suggested."""
 MIN_SIDE = 400
 """Longer side, px, down to which smaller photographs are suggested before fewer steps."""
 FEWER_STEPS, STEP_UNIT = 7000, 100
-"""Steps that are suggested then; if they take too long, a smaller multiple of the unit."""
+"""Steps to suggest after that; if they still take too long, a smaller multiple of the unit."""
 
 
 def step_seconds(device: str, gaussians: float, pixels: float) -> float:
@@ -47,18 +47,19 @@ class RunSpeed(NamedTuple):
 def mean_gaussians(settings: TrainSettings, now: RunSpeed) -> float:
     """Return the mean number of Gaussians over the remaining steps.
 
-    The number rises linearly until growth ends, where it reaches the budget if there is one.
+    The number grows linearly until densification ends. Strategies with a default budget fill the
+    cap; others reach ``GAUSSIANS_PER_SEED`` times the seeds, or the cap if it is lower.
     """
     strategy, count, left = settings.traits, now.gaussians, settings.max_steps - now.step
     full = strategy.full_at
     stop = settings.schedule.refine_stop if full is None else full * settings.max_steps
     stop = min(stop, settings.max_steps)
-    if not strategy.adds or now.step >= stop:
+    if not strategy.number_grows or now.step >= stop:
         return count
-    if strategy.has_budget:
+    if strategy.has_default_budget:
         last = float(settings.cap or count)
     else:
-        last = min(count * GROWTH ** (1 - now.step / stop), settings.cap or math.inf)
+        last = min(count * GAUSSIANS_PER_SEED ** (1 - now.step / stop), settings.cap or math.inf)
     rising = (stop - now.step) / left
     return count + max(0.0, last - count) * (1 - rising / 2)
 
@@ -73,7 +74,7 @@ def seconds_left(settings: TrainSettings, now: RunSpeed) -> float:
 
 
 def planned_seconds(settings: TrainSettings, seeds: int, pixels: int, threads: int) -> float:
-    """Return roughly the seconds of the steps of a run on the CPU that has not begun.
+    """Estimate the seconds of all steps of a run on the CPU.
 
     Args:
         settings: The run's.

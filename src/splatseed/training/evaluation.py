@@ -1,4 +1,4 @@
-"""Scoring a trained model: which scene it belongs to, how it was trained, and what to doubt.
+"""Scoring a trained model: its scene, how it was trained, and what may distort its scores.
 
 A run's config names its scene, the size of its photographs, its test views and its masks; a file of
 another trainer needs the scene. What is resolved here is loaded and scored by ``splat.evaluate``.
@@ -56,7 +56,7 @@ class Evaluation:
         scene: Scene | StrPath | None = None,
         request: EvaluateRequest = AS_TRAINED,
     ) -> Self:
-        """Resolve a request: what is left out, a run's config gives.
+        """Resolve a request: a run's config gives the values that the request leaves out.
 
         Raises:
             SceneNotFoundError: The model is missing.
@@ -100,7 +100,7 @@ class Evaluation:
         )
 
     def findings(self, loaded: TrainedModel) -> tuple[Finding, ...]:
-        """Return what may make the scores wrong, or others than expected."""
+        """Return what may make the scores wrong, or different from those that the user expects."""
         found, listed = [*loaded.findings], loaded.scene.listed
         if listed is not None:
             found.append(Finding("listed-split", listed.sentence, "info"))
@@ -111,7 +111,7 @@ class Evaluation:
         return tuple(found)
 
     def _changes(self, scene: Scene, tested: Sequence[str]) -> Iterator[Finding]:
-        """Yield what is not as in the run's training."""
+        """Yield how views, photographs, poses and masks differ from those of the run."""
         config, trained = self.config, trained_images(self.config, scene)
         if seen := tuple(name for name in tested if name in trained):
             every = config.get("test_every")
@@ -159,7 +159,7 @@ class Evaluation:
 
 
 def split_findings(model: Path, views: int) -> tuple[Finding, ...]:
-    """Return whether another trainer held out these test views; empty if it did.
+    """Return a finding if another trainer trained on the test views, or may have.
 
     graphdeco's trainer and its relatives write ``cfg_args`` into the model's folder, with
     ``eval=True`` if every 8th photograph was held out.

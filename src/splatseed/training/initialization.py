@@ -25,7 +25,7 @@ from splatseed.splat.training_frame import TrainingFrame, training_frame
 from splatseed.training.settings import TrainSettings
 
 MAX_PROJECTIONS, MIN_VIEWS = 20_000_000, 64
-"""Beyond this many points times views, an even subset of the views is used, of at least so many."""
+"""Beyond this many points times views, evenly spaced views are used, at least ``MIN_VIEWS``."""
 MARGIN = 0.1
 """A point outside the photograph by up to this fraction of its size counts as seen: a large
 Gaussian there reaches in."""

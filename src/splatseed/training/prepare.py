@@ -87,7 +87,7 @@ def prepare_run(
         output: The folder of the run.
         settings: How to train.
         options: What to do with the folder and the scene.
-        named: Settings that the run to resume must have even where they are the defaults.
+        named: Settings of the caller, which the run to resume must have even if they are defaults.
         cache_dir: The folder for downsampled photographs; None: they are not kept.
         depth_cache: The file in which the depths for strategy grow are kept.
         note: Called with each finding for the user.
@@ -132,7 +132,7 @@ def prepare_run(
     progress("compile", 0.0)
     with run.translate_errors():
         run.trainer.warm_up()
-    # What cannot be rendered has failed by now, and leaves no folder.
+    # Errors of rendering come before this line, so that they leave no folder.
     if setup.earlier:
         update_places(folder, setup.earlier, config)
     else:

@@ -58,7 +58,7 @@ class TrainingRun:
         views: tuple[Sequence[View], Sequence[View]],
     ) -> None:
         self.folder, self.settings, self.state, self.frame = folder, settings, state, frame
-        self._board: Any = None  # TensorBoard's writer, if asked for
+        self._board: Any = None  # TensorBoard's writer, if requested
         self._saved, self._saved_step = time.monotonic(), state.step or None
         self._test_views = views[1]
         train, test = ([frame.view(view) for view in part] for part in views)

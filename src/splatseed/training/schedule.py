@@ -32,12 +32,12 @@ LEARNING_RATES: Mapping[str, float] = MappingProxyType(
 """3DGS's."""
 DECAYS: Mapping[str, float] = MappingProxyType({"means": 0.01})
 """Final learning rates as a fraction of the initial ones; exponential in between."""
-GROWTH = 1.05
+MCMC_GROWTH = 1.05
 """Factor by which MCMC grows the number of Gaussians at a time, up to the cap."""
 MAX_SPEEDUP: Mapping[str, float] = MappingProxyType(
     {"means": 20.0, "scales": 4.0, "quats": 4.0, "opacities": 1.0, "sh0": 4.0, "shN": 16.0}
 )
-"""A run n times shorter than a full run has n times its learning rates, but at most so many times.
+"""A run n times shorter than a full run multiplies its learning rates by n, but at most by these.
 Positions have as far to go in a short run as in a long one, and 3DGS's rate of higher harmonics is
 a twentieth of the colour's; a higher rate of opacities removes Gaussians that are needed later."""
 FORGETTING = 1e-3
@@ -46,8 +46,8 @@ MAX_FORGETTING = 1e-2
 """A run n times shorter forgets n times faster, but at most this fraction per step: gradients
 shrink within some hundred steps, and Adam divides steps by the remembered gradients."""
 MIN_ROUND_STEPS = 20
-"""Minimum steps per round of a strategy with long rounds: splitting halves again before they have
-settled is noise."""
+"""Minimum steps between densifications where ``Traits.round_steps`` is set: halves that are split
+again before they have settled are noise."""
 MEAN_FROM = 0.8
 """Fraction of a run after which the mean of the Gaussians is taken."""
 DROPOUT = 0.2
@@ -72,16 +72,19 @@ class Schedule:
     decays: Mapping[str, float]  # final fraction of those rates that decay
     beta2: float  # Adam's: the fraction of the mean squared gradient kept at each step
     sh_every: int  # steps between degrees of the spherical harmonics; 0: all at once
-    refine_start: int  # densification begins after this step,
-    refine_stop: int  # ends before this step,
-    refine_every: int  # and comes every so many steps
+    refine_start: int
+    """Step at which densification starts. It follows each step, counted from 0, that is a multiple
+    of ``refine_every`` between ``refine_start`` and ``refine_stop``; ``grow`` includes these two
+    steps, gsplat's classes (``default``, ``mcmc``) do not."""
+    refine_stop: int  # step at which densification ends
+    refine_every: int  # steps between densifications
     reset_every: int
     """Steps between resets of the opacities, if enabled; also the step after which Gaussians that
     are too large are pruned."""
     prune_size: float = 0.1
     """Scale above which Gaussians are pruned, in size units; infinite in splatseed's conventions:
     large Gaussians show a bare wall or the sky best, and pruning them cost 2.8 dB in a room."""
-    growth: float = GROWTH  # factor by which MCMC grows the number of Gaussians at a time
+    growth: float = MCMC_GROWTH  # factor by which MCMC grows the number of Gaussians at a time
     noise: float = 5e5  # factor on 3DGS's learning rate of positions, for MCMC's noise
     penalty: float = 0.01  # weight of mean opacity and of mean size in MCMC's loss
     opacity: float = 0.1  # initial one
@@ -137,7 +140,7 @@ def make_schedule(strategy: Traits, max_steps: int, *, as_3dgs: bool) -> Schedul
 def continued(schedule: Schedule) -> Schedule:
     """Return the schedule of a run that continues from Gaussians: all harmonics at once.
 
-    Rates are those of a new run: lower rates lose (benchmarks/tried.md).
+    It keeps the rates of a new run: lower rates lose (benchmarks/tried.md).
     """
     return replace(schedule, sh_every=0, recycles=False)
 
@@ -161,7 +164,7 @@ def _own(theirs: Schedule, strategy: Traits) -> Schedule:
         refine_every=every,
         prune_size=math.inf,
         # Fewer rounds than 3DGS has grow by more each, so that the cap is reached as early.
-        growth=GROWTH ** (every / shrunk),
+        growth=MCMC_GROWTH ** (every / shrunk),
         scale_factor=1.0,
         max_size=MAX_SIZE,
         dropout=DROPOUT,

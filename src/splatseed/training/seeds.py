@@ -40,10 +40,10 @@ def seeded(
 ) -> tuple[Scene, StereoResult | None]:
     """Add the points of method ``auto`` to a scene, if the settings or the advice say so.
 
-    The settings' budget limits the points; a run that continues from Gaussians has none. Also
-    returns the depth maps that ``auto`` made, which growth uses too; None without any. Where the
-    points were ``triangulated`` while poses were refined, ``auto`` adds to them: on held-out
-    training views of two phones' walks it gained 0.34 and 0.96 dB under strategy ``grow``
+    The settings' budget limits the points; a run that continues from Gaussians needs none. Also
+    return the depth maps that ``auto`` made, for ``grow``; None if it made none. Where the points
+    were ``triangulated`` while poses were refined, ``auto`` adds to them: on held-out training
+    views of two phones' walks it gained 0.34 and 0.96 dB under strategy ``grow``
     (docs/known_poses.md), as bare walls have no features.
     """
     if settings.start is not None:
@@ -98,8 +98,8 @@ def usable_seeds(
     """Select the finite points, thin them to the budget, and drop attributes that are not used.
 
     Points in crowded parts of the training views (without views, of space) go first, and new points
-    before originals; of originals alone every n-th is kept. A strategy that adds Gaussians is left
-    room for them (``TrainSettings.max_seeds``).
+    before originals; of originals alone every n-th is kept. Strategies with a ``seed_share`` below
+    1 are left room for Gaussians that they add (``TrainSettings.max_seeds``).
     """
     seeds, cap = points.select(points.finite), settings.cap
     if len(seeds) < len(points):

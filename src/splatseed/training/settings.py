@@ -33,7 +33,7 @@ Exposure = Literal["none", "affine"]
 
 MIN_GAUSSIANS = 2
 BUDGET = 1_000_000
-"""Default cap of the strategies that have a budget."""
+"""The cap of strategies with a default budget, where the user sets none."""
 BYTES_PER_GAUSSIAN = 2000
 """Memory per Gaussian in training: its 59 numbers, their gradients and two moments (944 bytes),
 and as much again for the rasteriser's lists and for copies while Gaussians are added."""
@@ -44,17 +44,18 @@ class TrainSettings:
     """How to train.
 
     Options of ``train``, arguments of ``ss.train``, plans of ``bench`` and ``config.json`` have
-    these fields, with their defaults and docstrings. Suppressed fields are not options; files of
-    ``train --config``, plans, and ``ss.train`` set them.
+    these fields, with their docstrings and defaults (two defaults of ``train`` differ:
+    ``request.DEFAULTS``). Suppressed fields are not options; files of ``train --config``, plans,
+    and ``ss.train`` set them.
 
     Raises:
         ParameterError: A value has another type or is out of range.
     """
 
-    strategy: StrategyName = "default"
-    """Densify as 3DGS does (default), grow within a budget where renders are wrong (grow), densify
-    as MCMC does up to a budget (mcmc), keep the number of seeds (none), or what measured best, grow
-    (auto); -3dgs: 3DGS's own rates, sizes and schedules, to compare with published numbers."""
+    strategy: StrategyName = "default"  # of train: "auto"
+    """How Gaussians are added. grow: where renders are wrong, within a budget; auto: as grow does,
+    which scored best; mcmc: as MCMC does, up to a budget; strategy default: as 3DGS does; none: not
+    at all; -3dgs: 3DGS's own rates, sizes and schedules, to compare with published numbers."""
     max_steps: Annotated[int, Range(1)] = FULL_RUN
     """Training steps; schedules and learning rates adapt to them."""
     data_factor: Annotated[int | None, Range(1)] = None
@@ -120,7 +121,7 @@ class TrainSettings:
 
     @property
     def traits(self) -> Traits:
-        """The strategy's description; for ``auto`` that of the one that measured best."""
+        """The strategy's description; for ``auto`` that of ``grow``."""
         return traits_of(self.strategy)
 
     @property
@@ -135,7 +136,7 @@ class TrainSettings:
 
     @property
     def unused(self) -> tuple[str, ...]:
-        """Settings that differ from their defaults but have no effect on this strategy."""
+        """Settings that differ from their defaults but that only another strategy reads."""
         others = [each for each in STRATEGIES.values() if each is not self.traits]
         names = [name for each in others for name in each.own_settings]
         return tuple(name for name in names if getattr(self, name) != getattr(type(self), name))
@@ -153,6 +154,6 @@ class TrainSettings:
     @property
     def cap(self) -> int | None:
         """The maximum number of Gaussians; None for no limit."""
-        if self.cap_max is None and self.traits.has_budget:
+        if self.cap_max is None and self.traits.has_default_budget:
             return BUDGET
         return self.cap_max

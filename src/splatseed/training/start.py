@@ -36,7 +36,9 @@ ABSENT = -20.0
 
 
 def read_start(path: Path, scene: Scene, note: Note, *, same_poses: bool = False) -> Gaussians:
-    """Read the Gaussians of a file, in the scene's frame; ``same_poses``: surely trained in it.
+    """Read the Gaussians of a file, in the scene's frame.
+
+    With ``same_poses`` they were trained at the scene's poses, and need no search for their frame.
 
     Raises:
         SceneNotFoundError: There is no such file.

@@ -52,11 +52,11 @@ class Trainer:
         self.train_views = train_views
         self.test_views = test_views
         self.on_record = on_record
-        self.is_consistent = True  # the state is that between two steps, and may be saved
+        self.is_consistent = True  # no step is half done: the state may be saved
         self._photographs = PhotographCache(train_views, self.device)
 
     def run(self, on_step: Callable[[int], None] = lambda _: None) -> bool:
-        """Train to the last step, or until the user interrupts; return whether the last is done.
+        """Train to the last step, or until the user interrupts; return whether it was reached.
 
         ``on_step`` is called after each step with the number of steps done.
         """
@@ -126,7 +126,8 @@ class Trainer:
         optimize(params, optimizers, schedule.rates(step))
         if state.exposures is None:
             strategy.observe(params, view, render, photograph, step)
-        else:  # at the mean exposure, as the Gaussians that it adds
+        else:
+            # The strategy adds Gaussians in colours of the mean exposure, so it compares at that.
             at_mean = state.exposures.to_mean(index, photograph)
             strategy.observe(params, view, plain, at_mean, step)
         strategy.after_step(params, optimizers, step, info)
@@ -228,6 +229,6 @@ class _Loss(torch.autograd.Function):
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
         (gradient,) = ctx.saved_tensors
         # backward mostly starts at the loss, and multiplying by one takes a whole pass; on a GPU
-        # looking at the number would wait.
+        # reading the number would synchronise.
         at_loss = gradient.device.type == "cpu" and float(upstream[0]) == 1.0
         return gradient if at_loss else gradient * upstream[0], None

@@ -1,8 +1,8 @@
 """The strategies and what each needs: all that is known of a strategy without PyTorch.
 
 To add one, write a subclass of ``strategies.base.Strategy`` in a file of ``strategies/``, and
-describe it in ``STRATEGIES``; its name is then one of the command line's, of ``ss.train``'s and of
-plans'.
+describe it in ``_ALL``: the command line, ``ss.train`` and plans then accept its name. The help of
+``TrainSettings.strategy`` and docs/training.md describe it to users.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from types import MappingProxyType
 AS_3DGS = "-3dgs"
 """Suffix of a strategy's name: with 3DGS's rates, sizes and schedules."""
 AUTO, BEST = "auto", "grow"
-"""The name that stands for the strategy that measured best, and that strategy."""
+"""A name in settings, and the strategy that it stands for, which measured best."""
 GROW_EVERY = 2000
 """Steps of a full run between rounds of ``grow``, and before the first: a long round measures
 contributions to many photographs."""
@@ -28,24 +28,27 @@ class Traits:
 
     name: str
     implementation: str  # its class, as "file:class" in ``strategies/``
-    adds: bool = True  # changes the number of Gaussians
-    has_budget: bool = False  # has a maximum number of Gaussians, by default ``settings.BUDGET``
+    number_grows: bool = True  # the number of Gaussians grows; for estimates of time
+    has_default_budget: bool = False  # without --budget, ``settings.BUDGET`` is the cap
     seed_share: float = 1.0  # maximum seeds as a fraction of the budget
     uses_stereo: bool = False  # places Gaussians at depths that stereo finds
     own_settings: tuple[str, ...] = ()  # fields of ``TrainSettings`` that no other strategy uses
-    in_3dgs: bool = True  # exists in 3DGS's conventions, too
-    refine_stop: int = 15_000  # last step of densification
+    in_3dgs: bool = True  # exists in 3DGS's conventions, too: NAME-3dgs
+    refine_stop: int = 15_000  # step at which densification ends: ``Schedule.refine_stop``
     min_rounds: int = 1
-    """Minimum number of densifications. A short run densifies more often than every 100 steps, but
-    not much more: gradients averaged over few photographs are noise."""
+    """Minimum number of densifications without ``round_steps``. A short run densifies every 100
+    steps, and more often only to reach it: gradients averaged over few photographs are noise."""
     round_steps: int | None = None
-    """Steps between densifications, and before the first; None: 100 and 500, as in 3DGS."""
+    """Steps of a full run between densifications, and the step at which they start. Scaled to the
+    run, but at least ``schedule.MIN_ROUND_STEPS`` (20); not used in 3DGS's conventions. None: 100
+    and 500, as in 3DGS."""
     full_at: float | None = None
-    """Fraction of the run by which the budget is spent; None: when densification ends."""
-    first_opacity: float = 0.1  # of a Gaussian in 3DGS's conventions,
-    first_size: float = 1.0  # and its size as a multiple of the gap between Gaussians
+    """Fraction of the run by which the budget is spent, for estimates of time; None: when
+    densification ends."""
+    first_opacity: float = 0.1  # of a seed's Gaussian
+    first_size: float = 1.0  # in 3DGS's conventions: its size, as a multiple of the gap to others
     why_no_seeds: str = ""
-    """Why adding points before training does not help; empty if it does."""
+    """Why ``train`` adds no seeds, and ``info`` advises none; empty if more seeds help."""
 
 
 _ALL = (
@@ -55,7 +58,7 @@ _ALL = (
     Traits(
         "grow",
         "grow:ErrorDensification",
-        has_budget=True,
+        has_default_budget=True,
         uses_stereo=True,
         own_settings=("placing",),
         in_3dgs=False,
@@ -69,14 +72,14 @@ _ALL = (
     Traits(
         "mcmc",
         "mcmc:Mcmc",
-        has_budget=True,
+        has_default_budget=True,
         seed_share=0.7,
         refine_stop=25_000,
         min_rounds=24,
         first_opacity=0.5,
         first_size=0.1,
     ),
-    Traits("none", "base:Strategy", adds=False),
+    Traits("none", "base:Strategy", number_grows=False),
 )
 STRATEGIES: Mapping[str, Traits] = MappingProxyType({traits.name: traits for traits in _ALL})
 NAMES = (AUTO, *STRATEGIES, *(f"{each.name}{AS_3DGS}" for each in _ALL if each.in_3dgs))

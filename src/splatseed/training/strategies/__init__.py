@@ -1,1 +1,1 @@
-"""Densification strategies: ``base`` is their interface; ``default``, ``mcmc`` and ``grow``."""
+"""Densification strategies: ``base`` is their interface, ``training.traits`` lists their files."""

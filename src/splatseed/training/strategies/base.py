@@ -1,6 +1,7 @@
 """The interface of densification strategies, which change the number of Gaussians in training.
 
-Promise: ``state`` is all that a checkpoint must hold; both backends run the same classes.
+A checkpoint stores only ``state``: keep there whatever changes in training. CPU and CUDA use the
+same classes. Draw random numbers from PyTorch's generator, which is seeded before each step.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ class Strategy:
 
         Args:
             settings: The run's.
-            capacity: How many Gaussians it may grow to.
+            capacity: How many Gaussians it may grow to: adding none beyond ``capacity.limit`` is
+                up to the strategy.
             depths: For strategies that use stereo: planar depth of training views by name, in
                 training units, 0 where unknown.
             share: The fraction of the training views that have depths.
@@ -63,4 +65,11 @@ class Strategy:
         """Measure the result of a step, after the optimisers and before ``after_step``."""
 
     def after_step(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
-        """Add, remove or move Gaussians; may replace parameters and their moments."""
+        """Add, remove or move Gaussians, after the optimisers have taken step ``step`` (from 0).
+
+        Change their number with ``remove``, ``split`` and the other functions of
+        ``gsplat.strategy.ops``: they also change the parameter ``min_view_depth``, the optimisers'
+        moments, and the tensors in the state that is passed to them, which must be [N, ...]. Never
+        remove all Gaussians, or nothing is left to render. From step ``Schedule.mean_from`` on
+        (``refine_stop`` or later) a changed number restarts the mean that becomes the result.
+        """
