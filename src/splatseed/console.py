@@ -254,8 +254,8 @@ def print_pairs(title: str, rows: Sequence[tuple[str, str]]) -> None:
 
 
 def print_note(*findings: Finding) -> None:
-    """Print findings, with options for the library's arguments."""
-    for finding in findings:
+    """Print findings, each once, with options for the library's arguments."""
+    for finding in dict.fromkeys(findings):
         OUT.print("note:", style="yellow", end=" ")
         OUT.print(visible(with_options(str(finding))), soft_wrap=True)
 

@@ -232,7 +232,8 @@ class SceneSource:
     transforms_path: Path | None = None  # if it was read
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # recorded beside its files
     named: Path | None = None  # what the user named, which may be one model or file of several
-    convention: str = f"poses are cam_from_world, {OPENCV}"  # of the files' poses, as a clause
+    convention: str = f"poses are cam_from_world, {OPENCV}"
+    """Of the files' poses: completes "Write the poses so: ..."."""
 
     @property
     def again(self) -> Path | None:
@@ -302,7 +303,9 @@ class Scene:
     listed: Split | None = None  # the split given by lists beside the scene
     left_out: LeftOut = field(default_factory=LeftOut)  # how many points of its files were
     masks: Masks | None = None  # which pixels of its photographs do not count; None: all count
-    absent: tuple[str, ...] = ()  # names of images that were left out; the split counts them
+    absent: tuple[
+        str, ...
+    ] = ()  # names of images left out; they keep their place in ``test_every``
     white: int = 65535  # the value of white in photographs of 16 bits a channel
     origin: Float64[np.ndarray, " 3"] = field(default_factory=lambda: np.zeros(3))
 

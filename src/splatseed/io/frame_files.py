@@ -218,14 +218,13 @@ def named_masks(
     found = files.masks(named.values())
     missing = [mask for mask in named.values() if mask not in found]
     masks = {name: found[mask].path for name, mask in named.items() if mask in found}
-    return masks, _not_found(files, "mask", missing)
+    return masks, _not_found("missing-masks", files, "mask", missing)
 
 
-def _not_found(files: FrameFiles, noun: str, missing: Sequence[str]) -> list[Finding]:
+def _not_found(kind: str, files: FrameFiles, noun: str, missing: Sequence[str]) -> list[Finding]:
     if not missing:
         return []
     what = f"{counted(len(missing), noun)} named in {files.path.name} cannot be found"
-    kind = f"missing-{noun.replace(' ', '-')}s"
     return [Finding(kind, f"{what}, such as {missing[0]}.", subjects=tuple(missing))]
 
 
@@ -248,7 +247,7 @@ def named_depths(
             if depth in found and found[depth].path.suffix.lower() in DEPTH_SUFFIXES:
                 paths[name], key_used = found[depth].path, key_used or key
     lost = [depth for name, depth in missing.items() if name not in paths]
-    findings = _not_found(files, "depth map", lost)
+    findings = _not_found("missing-depth-maps", files, "depth map", lost)
     if not paths:
         return None, findings
     unit = _depth_unit(files, key_used, paths, [{**meta, **frames[name]} for name in paths])

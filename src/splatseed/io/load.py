@@ -1,6 +1,6 @@
 """Load a scene of any format, and find depth maps for its images.
 
-Recoverable problems become ``Scene.findings``; others raise one error.
+A reader reports what it can work around as ``Scene.findings``, and raises an error for the rest.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from splatseed.depthmap import DepthKind
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError, SplatseedError
@@ -53,17 +54,26 @@ _TRANSFORMS = "transforms.json"
 _MAX_LEVELS_UP = 3
 """How many parent folders of a file are searched for its scene."""
 _SCAN_SUFFIXES = frozenset({".las", ".laz", ".e57", ".pcd", ".xyz", ".asc", ".pts", ".glb"})
+
+
+class Reader(NamedTuple):
+    """A format of folders that hold neither a COLMAP model nor a transforms.json."""
+
+    files: str  # by which it is recognised, for messages
+    recognises: Callable[[Path], bool]
+    read: Callable[[Path], Scene]
+
+
 READERS = (
-    (is_llff, read_llff),
-    (is_replica, load_rgbd),
-    (is_tum, load_tum),
-    (is_scanner_app, read_scanner_app),
-    (is_polycam, read_polycam),
-    (is_record3d, read_record3d),
-    (is_stray, read_stray),
+    Reader("poses_bounds.npy", is_llff, read_llff),
+    Reader("traj.txt", is_replica, load_rgbd),
+    Reader("rgb.txt with groundtruth.txt", is_tum, load_tum),
+    Reader("3D Scanner App's frame_00000.json", is_scanner_app, read_scanner_app),
+    Reader("Polycam's keyframes", is_polycam, read_polycam),
+    Reader("Record3D's EXR_RGBD", is_record3d, read_record3d),
+    Reader("Stray Scanner's rgb.mp4 with odometry.csv", is_stray, read_stray),
 )
-"""Formats of folders without a COLMAP model or transforms.json: what recognises one by its files,
-and what reads it as a ``Scene``."""
+"""Tried in this order, after COLMAP models and transforms.json."""
 _TRIANGULATE = (
     "Method auto needs none: splatseed upsample SCENE -o OUT. Or make points with: splatseed sfm"
     " IMAGES --poses-from SCENE -o OUT."
@@ -171,7 +181,8 @@ def _reader(folder: Path) -> Callable[[], Scene] | None:
         return partial(read_blender, folder)
     if (nested := nested_model(folder)) is not None:
         return partial(read_model, nested)
-    return next((partial(read, folder) for known, read in READERS if known(folder)), None)
+    found = (partial(each.read, folder) for each in READERS if each.recognises(folder))
+    return next(found, None)
 
 
 def _read_file(path: Path) -> Scene:
@@ -247,9 +258,9 @@ def _no_scene_error(path: Path) -> SceneNotFoundError:
     else:
         fix = "Pass the scene's folder, or a .ply or .json file. To reconstruct photographs, "
         fix += "run: splatseed sfm IMAGES -o SCENE."
-    expected = f"sparse/0, sparse, colmap/sparse/0, {_TRANSFORMS}, poses_bounds.npy, "
-    expected += "traj.txt or groundtruth.txt"
-    return SceneNotFoundError(f"{expected} in {path}", found=found, fix=fix)
+    *first, last = (each.files for each in READERS)
+    expected = ", ".join(["sparse/0, sparse, colmap/sparse/0", _TRANSFORMS, *first])
+    return SceneNotFoundError(f"{expected} or {last} in {path}", found=found, fix=fix)
 
 
 def _run_error(path: Path) -> SceneNotFoundError:

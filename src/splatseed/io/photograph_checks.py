@@ -143,7 +143,7 @@ def exif_orientation(path: Path) -> int:
 def photograph_findings(
     images: Sequence[Image], image_dir: Path | None, root: Path
 ) -> list[Finding]:
-    """Find missing photographs, and cameras that do not fit their sizes."""
+    """Find missing photographs, and cameras that do not fit their sizes; drops none."""
     if not images:
         return []
     odd = _odd_cameras(images)

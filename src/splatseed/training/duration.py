@@ -13,9 +13,9 @@ from typing import NamedTuple
 from splatseed.training.settings import TrainSettings
 
 COSTS = {"cpu": (5e-3, 0.35e-6, 0.15e-6), "cuda": (8e-3, 5e-9, 2e-9)}
-"""a, b and c. On the CPU: of 2 cores, between a quiet machine with AVX-512 and a busy one with AVX2,
-on nine captures; with CUDA: of one GPU with 3 million Gaussians. Another machine may be twice as
-fast or half as fast; the proportions of a, b and c differ less."""
+"""a, b and c. On the CPU: of 2 cores, between a quiet machine with AVX-512 and a busy machine with
+AVX2, on nine captures; with CUDA: of one GPU with 3 million Gaussians. Another machine may be twice
+as fast or half as fast; the proportions of a, b and c differ less."""
 MEASURED_THREADS = 2
 """Threads with which the CPU's costs were measured; more threads divide the time of a step."""
 GAUSSIANS_PER_SEED = 3.0
