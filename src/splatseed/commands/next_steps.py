@@ -26,7 +26,7 @@ from splatseed.training.duration import planned_seconds
 from splatseed.training.request import DEFAULTS
 from splatseed.training.schedule import FULL_RUN
 from splatseed.training.settings import BUDGET, TrainSettings
-from splatseed.training.traits import Traits
+from splatseed.training.traits import StrategyTraits
 
 TrainerName: TypeAlias = Literal[
     "splatseed", "gsplat", "graphdeco", "nerfstudio", "brush", "opensplat", "lichtfeld"
@@ -54,7 +54,7 @@ class Planned(NamedTuple):
     budget: int
     rho: str  # the budget per pixel, and the photograph's size; empty without photographs
     max_steps: int
-    strategy: Traits
+    strategy: StrategyTraits
     max_seeds: int
     flags: str
     trainer: TrainerName

@@ -28,7 +28,7 @@ RECENTER = "recenter.json"
 
 
 @dataclass(frozen=True)
-class Limits:
+class OriginLimits:
     """Thresholds; extents are of the cameras, or of the points without cameras."""
 
     float32_step: float = 2.0**-23
@@ -48,7 +48,7 @@ class Limits:
     """Extents (points' plus cameras') from which points and cameras are in different frames."""
 
 
-LIMITS = Limits()
+LIMITS = OriginLimits()
 
 
 def choose_origin(

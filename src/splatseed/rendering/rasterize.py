@@ -148,7 +148,7 @@ def rasterization(
     fits = not sparse_grad or (packed and not batch)
     _require(fits, "packed=True and no batch dimensions with sparse_grad=True", batch or packed)
     parts = colors if isinstance(colors, tuple) else (colors,)
-    views: list[Projected] = []
+    views: list[ProjectedGaussians] = []
     shades: list[Tensor] = []
     for scene in _unbatched(batch, means, quats, scales, opacities, viewmats, Ks, *parts):
         gaussians, poses, intrinsics = scene[:4], scene[4], scene[5]
@@ -191,7 +191,7 @@ def _unbatched(batch: tuple[int, ...], *tensors: Tensor) -> Iterable[tuple[Tenso
 
 def _project(
     gaussians: Sequence[Tensor], viewmat: Tensor, params: ProjectionParams, sparse: bool
-) -> Projected:
+) -> ProjectedGaussians:
     """Project means, quats, scales and opacities into one camera."""
     opacities = gaussians[3]
     radii, means2d, depths, conics, compensations = Project.apply(
@@ -199,7 +199,7 @@ def _project(
     )
     if params.antialiased:
         opacities = opacities * compensations
-    return Projected(radii, means2d, depths, conics, opacities)
+    return ProjectedGaussians(radii, means2d, depths, conics, opacities)
 
 
 def _colors(
@@ -207,7 +207,7 @@ def _colors(
     colors: Sequence[Tensor],
     viewmats: Tensor,
     camera: int,
-    view: Projected,
+    view: ProjectedGaussians,
     sh_degree: int | None,
 ) -> Tensor:
     """Return the colours of N Gaussians in one camera, [N, D]; ``colors`` is a tensor or a pair."""
@@ -229,7 +229,7 @@ def _channels(colors: Tensor, depth: Tensor, render_mode: RenderMode) -> Tensor:
 
 
 def _blend(
-    views: Sequence[Projected],
+    views: Sequence[ProjectedGaussians],
     shades: Sequence[Tensor],
     info: Info,
     backgrounds: Tensor | None,
@@ -332,7 +332,7 @@ def _require(fits: object, expected: str, found: object) -> None:
         raise ParameterError(expected, found=str(found), fix=fix)
 
 
-class Projected(NamedTuple):
+class ProjectedGaussians(NamedTuple):
     """N Gaussians in one camera."""
 
     radii: Tensor
@@ -383,7 +383,7 @@ class Info(dict[str, Any]):
 
 
 def _make_info(
-    views: Sequence[Projected],
+    views: Sequence[ProjectedGaussians],
     batch: tuple[int, ...],
     packed: bool,
     width: int,
@@ -399,7 +399,7 @@ def _make_info(
         images = torch.cat([torch.full_like(each, image) for image, each in enumerate(ids)])
         info["batch_ids"], info["camera_ids"] = images // cameras, images % cameras
         info["gaussian_ids"] = torch.cat(ids)
-    for name, tensors in zip(Projected._fields, zip(*views, strict=True), strict=True):
+    for name, tensors in zip(ProjectedGaussians._fields, zip(*views, strict=True), strict=True):
         if packed:
             info[name] = torch.cat([t[each] for t, each in zip(tensors, ids, strict=True)])
         else:  # a single image's entries are not copied

@@ -68,7 +68,7 @@ DENSE = _DenseSettings()
 
 
 @dataclass(frozen=True)
-class Plan:
+class ComparisonPlan:
     """How photographs are compared again."""
 
     factor: int  # photographs are reduced by this
@@ -168,7 +168,7 @@ def _shortage(scene: Scene, points: PointCloud, budget: int, need: int) -> Findi
 
 def plan_comparisons(
     images: Sequence[Image], first: int, grid: int, finest: float, num: int
-) -> list[Plan]:
+) -> list[ComparisonPlan]:
     """Plan the second comparison: what the spacing needs, then what needs less and less memory.
 
     Args:
@@ -194,7 +194,7 @@ def plan_comparisons(
     return plans
 
 
-def _plan(images: Sequence[Image], factor: int, grid: int, split: int, num: int) -> Plan:
+def _plan(images: Sequence[Image], factor: int, grid: int, split: int, num: int) -> ComparisonPlan:
     """Estimate the memory of a comparison."""
     sizes = [(im.camera.width // factor, im.camera.height // factor) for im in images]
     pixels = [width * height for width, height in sizes]
@@ -211,13 +211,15 @@ def _plan(images: Sequence[Image], factor: int, grid: int, split: int, num: int)
     more = max(matching, fusion)
     free = free_memory()
     within = free is None or more <= DENSE.usable * free
-    return Plan(factor, grid, split, sum(depths), (resident_bytes() or PROCESS) + more, within)
+    return ComparisonPlan(
+        factor, grid, split, sum(depths), (resident_bytes() or PROCESS) + more, within
+    )
 
 
 def _announcement(
     limit: int,
     images: Sequence[Image],
-    plan: Plan,
+    plan: ComparisonPlan,
     stereo: StereoResult,
     seconds: Mapping[str, float],
 ) -> Finding:

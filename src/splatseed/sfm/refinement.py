@@ -32,7 +32,7 @@ from splatseed.text import counted, name_some
 
 
 @dataclass(frozen=True)
-class Limits:
+class RefinementLimits:
     """Thresholds of refinement; lengths are relative to the cameras' spread."""
 
     coarse: tuple[float, ...] = (6.0, 2.0)
@@ -66,7 +66,7 @@ class Limits:
     """Smallest noise of the alignment, also in radians: equal poses have none."""
 
 
-LIMITS = Limits()
+LIMITS = RefinementLimits()
 _NORMAL_MEDIAN = 1.54  # median length of a 3-vector of standard normal numbers
 
 

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from splatseed.training.traits import Traits
+from splatseed.training.traits import StrategyTraits
 
 FULL_RUN = 30_000
 
@@ -46,8 +46,8 @@ MAX_FORGETTING = 1e-2
 """A run n times shorter forgets n times faster, but at most this fraction per step: gradients
 shrink within some hundred steps, and Adam divides steps by the remembered gradients."""
 MIN_ROUND_STEPS = 20
-"""Minimum steps between densifications where ``Traits.round_steps`` is set: halves that are split
-again before they have settled are noise."""
+"""Minimum steps between densifications where ``StrategyTraits.round_steps`` is set: halves that are
+split again before they have settled are noise."""
 MEAN_FROM = 0.8
 """Fraction of a run after which the mean of the Gaussians is taken."""
 DROPOUT = 0.2
@@ -114,7 +114,7 @@ class Schedule:
         return float(self.decays.get(name, 1.0) ** (step / self.max_steps))
 
 
-def make_schedule(strategy: Traits, max_steps: int, *, as_3dgs: bool) -> Schedule:
+def make_schedule(strategy: StrategyTraits, max_steps: int, *, as_3dgs: bool) -> Schedule:
     """Return the schedule of a run of T steps with a strategy.
 
     3DGS's conventions are those of gsplat's trainer with its ``steps_scaler``: step numbers are
@@ -145,7 +145,7 @@ def continued(schedule: Schedule) -> Schedule:
     return replace(schedule, sh_every=0, recycles=False)
 
 
-def _own(theirs: Schedule, strategy: Traits) -> Schedule:
+def _own(theirs: Schedule, strategy: StrategyTraits) -> Schedule:
     """Return splatseed's schedule: its departures from 3DGS's."""
     speedup, stop = max(FULL_RUN / theirs.max_steps, 1.0), theirs.refine_stop
     # 3DGS densifies every 100 steps of 30,000.

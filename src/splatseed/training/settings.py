@@ -19,7 +19,7 @@ from splatseed.progress import Note, silent_note
 from splatseed.scene import Image
 from splatseed.settings import Range, check_settings
 from splatseed.training.schedule import FULL_RUN, Schedule, continued, make_schedule
-from splatseed.training.traits import AS_3DGS, NAMES, STRATEGIES, Traits, traits_of
+from splatseed.training.traits import AS_3DGS, NAMES, STRATEGIES, StrategyTraits, strategy_traits
 
 if TYPE_CHECKING:
     StrategyName = str
@@ -120,9 +120,9 @@ class TrainSettings:
         return self.data_factor or 1
 
     @property
-    def traits(self) -> Traits:
+    def traits(self) -> StrategyTraits:
         """The strategy's description; for ``auto`` that of ``grow``."""
-        return traits_of(self.strategy)
+        return strategy_traits(self.strategy)
 
     @property
     def as_3dgs(self) -> bool:

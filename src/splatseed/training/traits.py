@@ -23,7 +23,7 @@ FULL_AT = 0.35
 
 
 @dataclass(frozen=True)
-class Traits:
+class StrategyTraits:
     """What a strategy needs, and its timing in a run of 30,000 steps."""
 
     name: str
@@ -52,10 +52,10 @@ class Traits:
 
 
 _ALL = (
-    Traits(
+    StrategyTraits(
         "default", "default:Default", seed_share=0.7, own_settings=("opacity_reset",), min_rounds=6
     ),
-    Traits(
+    StrategyTraits(
         "grow",
         "grow:ErrorDensification",
         has_default_budget=True,
@@ -69,7 +69,7 @@ _ALL = (
         "measured. Under 3DGS's densification, which other trainers use, that gained 0.2 dB on "
         "average: splatseed upsample adds them.",
     ),
-    Traits(
+    StrategyTraits(
         "mcmc",
         "mcmc:Mcmc",
         has_default_budget=True,
@@ -79,13 +79,15 @@ _ALL = (
         first_opacity=0.5,
         first_size=0.1,
     ),
-    Traits("none", "base:Strategy", number_grows=False),
+    StrategyTraits("none", "base:Strategy", number_grows=False),
 )
-STRATEGIES: Mapping[str, Traits] = MappingProxyType({traits.name: traits for traits in _ALL})
+STRATEGIES: Mapping[str, StrategyTraits] = MappingProxyType(
+    {traits.name: traits for traits in _ALL}
+)
 NAMES = (AUTO, *STRATEGIES, *(f"{each.name}{AS_3DGS}" for each in _ALL if each.in_3dgs))
 """The names of strategies in settings."""
 
 
-def traits_of(name: str) -> Traits:
+def strategy_traits(name: str) -> StrategyTraits:
     """Return the traits of a strategy by one of ``NAMES``."""
     return STRATEGIES[BEST if name == AUTO else name.removesuffix(AS_3DGS)]
