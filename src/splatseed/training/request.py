@@ -21,7 +21,7 @@ from splatseed.training.settings import Backend, TrainSettings
 MaskChoice = Annotated[str | None, tyro.conf.arg(metavar="DIR|none|inverted[:DIR]")]
 """The masks to use: see ``io.masks.with_masks``."""
 DEFAULTS = TrainSettings(strategy="auto", seeding="advised")
-"""The settings of a new run of ``train``, which scored best; a resumed run has its own.
+"""The settings of a new run of ``train``, those that score best; a resumed run has its own.
 
 ``TrainSettings()`` has strategy ``default`` (gsplat's name for 3DGS's densification) and the
 scene's points: plans of ``bench`` start from it, to compare methods as in 3DGS.
