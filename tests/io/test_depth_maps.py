@@ -15,8 +15,8 @@ from PIL import Image as PilImage
 from splatseed.camera import Intrinsics
 from splatseed.depthmap import DepthMap
 from splatseed.errors import OutputError, ParameterError, SceneFormatError, SceneNotFoundError
-from splatseed.io import find_depths
-from splatseed.io.depth_maps import DESCRIPTION, Undistortion, depth_folder
+from splatseed.io import find_depths, load_scene
+from splatseed.io.depth_maps import DESCRIPTION, Undistortion, depth_folder, map_findings
 from splatseed.io.staging import MANIFEST
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
@@ -235,3 +235,28 @@ def test_a_name_out_of_the_folder_stays_inside(tmp_path):
     assert [path.name for path in (tmp_path / "a").iterdir()] == ["out"]
     found = find_depths(scene_of("../images/f.jpg"), tmp_path / "a" / "out")
     assert list(found) == ["../images/f.jpg"]
+
+
+@pytest.mark.parametrize("place", ["depths", "sparse/0", "."])
+def test_graphdecos_lines_make_inverse_depth(scene_dir, place):
+    scene = load_scene(scene_dir)
+    for image in scene.images:
+        path = scene_dir / "depths" / f"{image.name.rpartition('.')[0]}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        PilImage.fromarray(np.array([[0, 1000], [2000, 65535]], np.uint16)).save(path)
+    stems = [image.name.rpartition(".")[0] for image in scene.images]
+    lines = {stem: {"scale": 2.0, "offset": 0.5} for stem in stems} | {stems[1]: {"scale": 0}}
+    lines[stems[1]] |= {"offset": 0}  # a failed fit
+    (scene_dir / place / "depth_params.json").write_text(json.dumps(lines))
+    maps = find_depths(scene, scene_dir / "depths")
+    first, second = (maps.read(image.name) for image in scene.images[:2])
+    assert first.kind == second.kind == "inverse"
+    expected = 2 * np.array([1000, 2000, 65535]) / 65536 + 0.5
+    np.testing.assert_allclose(first.values[np.isfinite(first.values)], expected, rtol=1e-6)
+    assert second.values[0, 1] == 1
+    assert [each.kind for each in map_findings(maps)] == ["depth-kind"]
+    named = find_depths(scene, scene_dir / "depths", kind="z")
+    assert named.read(scene.images[0].name).values[0, 1] == 1
+    (scene_dir / place / "depth_params.json").write_text("[1]")
+    with pytest.raises(SceneFormatError, match=r"depth_params\.json"):
+        find_depths(scene, scene_dir / "depths")

@@ -19,6 +19,7 @@ from splatseed.io.cleaning import clean_scene, outlier_findings
 from splatseed.io.colmap_model import find_model, nested_model, read_model, scene_model, scene_root
 from splatseed.io.depth_files import KINDS, SUFFIXES
 from splatseed.io.depth_maps import (
+    DEPTH_KIND,
     DISTORTED_MAPS,
     WITHOUT_CONFIDENCE,
     DepthFiles,
@@ -304,7 +305,8 @@ def find_depths(
             found="none" if name else "a scene without images",
             fix="Give maps the names of their images, subfolders included, with another suffix.",
         )
-    maps = replace(maps, kind=kind or maps.kind, scale=scale or maps.scale)
+    lines = {} if scale else maps.lines  # an explicit scale is that of plain values
+    maps = replace(maps, kind=kind or maps.kind, scale=scale or maps.scale, lines=lines)
     maps = fitted_to_undistorted(scene, maps)
     own = scene.depths
     if isinstance(own, DepthFiles) and _same_maps(own, maps):
@@ -324,7 +326,7 @@ def with_depths_in(
 
 def _with_maps(scene: Scene, maps: DepthFiles | None) -> Scene:
     """Attach maps, with findings about them in place of those about the scene's own."""
-    kept = without_kinds(scene.findings, DISTORTED_MAPS, WITHOUT_CONFIDENCE)
+    kept = without_kinds(scene.findings, DEPTH_KIND, DISTORTED_MAPS, WITHOUT_CONFIDENCE)
     return scene.replace(depths=maps, findings=(*kept, *map_findings(maps)))
 
 
