@@ -95,6 +95,8 @@ class FrameFiles:
         ends = [root.joinpath(*parts[start:]) for start in range(len(parts))]
         if moved or len(parts) == 1:  # else the folder may distinguish files of one name
             ends += [root / folder / parts[-1] for folder in folders if parts]
+        if suffixes and len(parts) > 1 and not _has_files(root / parts[0]):
+            ends += [root.joinpath(each, *parts[1:]) for each in _resized_folders(parts[0])]
         for end in map(_absolute, ends):
             if near := self._near(end, suffixes):
                 return Found(near, relocated=True)
@@ -116,6 +118,18 @@ class FrameFiles:
                 if (file := path.with_name(name)).is_file() and (end or not exact):
                     return file
         return None
+
+
+def _has_files(folder: Path) -> bool:
+    return folder.is_dir() and any(folder.iterdir())
+
+
+def _resized_folders(name: str) -> list[str]:
+    """Return the names of folders that hold the photographs of another at other sizes."""
+    plain = re.sub(r"_[248]\Z", "", name)
+    return [
+        each for each in (plain, *(f"{plain}_{factor}" for factor in (2, 4, 8))) if each != name
+    ]
 
 
 def _spellings(name: str) -> Iterator[str]:

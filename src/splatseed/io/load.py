@@ -167,13 +167,13 @@ def _reader(folder: Path) -> Callable[[], Scene] | None:
     if read_manifest(folder).get("format") == "both" and (folder / _TRANSFORMS).is_file():
         return partial(read_transforms_scene, folder / _TRANSFORMS)  # it says more: masks, depth
     if (model := scene_model(folder)) is not None:
-        return partial(read_model, model)
+        return partial(read_model, model, folder)
     if (folder / _TRANSFORMS).is_file():
         return partial(read_transforms_scene, folder / _TRANSFORMS)
     if is_blender(folder):
         return partial(read_blender, folder)
     if (nested := nested_model(folder)) is not None:
-        return partial(read_model, nested)
+        return partial(read_model, nested, folder)
     return next((partial(read, folder) for known, read in READERS if known(folder)), None)
 
 
