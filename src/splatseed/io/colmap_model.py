@@ -22,6 +22,7 @@ from splatseed.findings import Finding, Severity
 from splatseed.io.camera_records import Unusable, check_enough, unusable_findings, unusable_images
 from splatseed.io.colmap import MIN_IMAGE_BYTES, read_cameras, read_images, read_points3d
 from splatseed.io.files import StrPath, is_hidden, numbered_lines, open_file
+from splatseed.io.image_names import named_as_files
 from splatseed.io.origin import recentered
 from splatseed.io.photograph import lens_findings
 from splatseed.io.photograph_checks import photograph_findings
@@ -110,7 +111,7 @@ def count_images(model_dir: Path) -> int:
 
 def _count_lines(path: Path) -> int:
     """Count the images of ``images.txt``: two lines each, of which the second may be blank."""
-    count, lines = 0, numbered_lines(path)
+    count, lines = 0, numbered_lines(path, errors="replace")
     for _, line in lines:
         if line.strip() and not line.lstrip().startswith("#"):
             count += 1
@@ -216,9 +217,11 @@ def read_colmap_scene(model_dir: StrPath) -> Scene:
     root = scene_root(model_dir)
     intrinsics, images, left_out = read_model_cameras(model_dir)
     unusable = unusable_images(left_out)
+    path = model_file(model_dir, "images") or model_dir
+    images, findings = named_as_files(images, _image_folders(root), path)
     points, exact, tracks, points_path = read_model_points(model_dir)
     image_dir = _image_dir(root, images)
-    findings = [*photograph_findings(images, image_dir, root), *lens_findings(images)]
+    findings += [*photograph_findings(images, image_dir, root), *lens_findings(images)]
     findings += unusable_findings(unusable, len(images))
     findings += _unposed_findings(root, image_dir, images)
     findings += _other_points(model_dir, root, points_path, points)
@@ -249,19 +252,23 @@ def _image_dir(root: Path, images: Sequence[Image]) -> Path | None:
     Not the first with all: where one lacks a photograph, the next may hold reduced copies or, as
     graphdeco's ``input``, photographs with distortion that the model's cameras do not have.
     """
-    folders = [root / name for name in IMAGE_DIRS if (root / name).is_dir()]
     counts_by_folder = dict[Path, int]()
-    for folder in (*folders, root):
-        counts_by_folder[folder] = sum((folder / image.name).is_file() for image in images)
-        if 2 * counts_by_folder[folder] >= len(images) > 0:
-            return folder
-    above = [root.absolute().parent / name for name in ("input", *IMAGE_DIRS)]
-    for folder in above if root.name == "distorted" or root.name.isdecimal() else ():
+    folders = _image_folders(root)
+    for folder in folders:
         counts_by_folder[folder] = sum((folder / image.name).is_file() for image in images)
         if 2 * counts_by_folder[folder] >= len(images) > 0:
             return folder
     best = max(counts_by_folder, key=lambda folder: counts_by_folder[folder])
-    return best if counts_by_folder[best] else next(iter(folders), None)
+    return best if counts_by_folder[best] else next((f for f in folders if root in f.parents), None)
+
+
+def _image_folders(root: Path) -> list[Path]:
+    """Return the folders that may hold a scene's photographs, most likely first."""
+    above: list[Path] = []
+    if root.name == "distorted" or root.name.isdecimal():
+        above = [root.absolute().parent / name for name in ("input", *IMAGE_DIRS)]
+    inside = [root / name for name in IMAGE_DIRS]
+    return [each for each in (*inside, root, *above) if each.is_dir()]
 
 
 def _unposed_findings(root: Path, image_dir: Path | None, images: Sequence[Image]) -> list[Finding]:

@@ -1,8 +1,8 @@
 r"""Photographs, masks and depth maps that the frames of a ``transforms.json`` name.
 
 A name is tried as written first. For files from another computer, \\ and / are equal, as are %20
-and a space; a missing suffix, other case or another parent folder are allowed. Promise: a file of
-another name is never used.
+and a space, and both forms of an umlaut in Unicode; a missing suffix, other case or another parent
+folder are allowed. Promise: a file of another name is never used.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import os
 import re
+import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -135,7 +136,9 @@ def _resized_folders(name: str) -> list[str]:
 def _spellings(name: str) -> Iterator[str]:
     yield name
     yield name.replace("\\", "/")
-    yield unquote(name.replace("\\", "/"))
+    plain = unquote(name.replace("\\", "/"))
+    yield from (unicodedata.normalize(form, plain) for form in ("NFC", "NFD"))
+    yield plain
 
 
 def _absolute(path: Path) -> Path:
