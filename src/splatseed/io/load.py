@@ -51,7 +51,7 @@ from splatseed.io.undistorted import fitted_to_undistorted
 from splatseed.scene import Scene, SceneSource
 from splatseed.text import name_some, quoted
 
-_TRANSFORMS = "transforms.json"
+_TRANSFORMS, _BLENDER = "transforms.json", "transforms_train.json"
 _MAX_LEVELS_UP = 3
 """How many parent folders of a file are searched for its scene."""
 _SCAN_SUFFIXES = frozenset({".las", ".laz", ".e57", ".pcd", ".xyz", ".asc", ".pts", ".glb"})
@@ -66,6 +66,19 @@ READERS = (
 )
 """Formats of folders without a COLMAP model or transforms.json: what recognises one by its files,
 and what reads it as a ``Scene``."""
+_INCOMPLETE = (
+    ("rgb.txt", "groundtruth.txt", "the poses, each line: time, tx ty tz, qx qy qz qw"),
+    ("groundtruth.txt", "rgb.txt", "the photographs, each line: time, path"),
+    ("transforms_test.json", _BLENDER, "the frames to train on"),
+    ("transforms_val.json", _BLENDER, "the frames to train on"),
+    ("cam_params.json", "traj.txt", "the poses, each line: 16 numbers of world_from_cam"),
+    ("odometry.csv", "rgb.mp4", "the photographs of Stray Scanner's recording"),
+    ("camera_matrix.csv", "odometry.csv", "the poses of Stray Scanner's recording"),
+    ("database.db", "sparse/0", "the model that COLMAP's mapper makes of its database"),
+)
+"""Files that a folder has, the file that it then needs, and its content."""
+_TRAJECTORIES = ("CameraTrajectory.txt", "KeyFrameTrajectory.txt")
+"""ORB-SLAM's files of poses, of the form of ``groundtruth.txt``."""
 _TRIANGULATE = (
     "Method auto needs none: splatseed upsample SCENE -o OUT. Or make points with: splatseed sfm"
     " IMAGES --poses-from SCENE -o OUT."
@@ -239,6 +252,9 @@ def _no_scene_error(path: Path) -> SceneNotFoundError:
     if read_manifest(path).get("command") == "train":
         return _run_error(path)
     scenes = [child.name for child in sorted(path.iterdir()) if is_scene(child)]
+    incomplete = None if scenes else _incomplete_error(path)
+    if incomplete is not None:
+        return incomplete
     files = {file.name for pattern in ("*.json", "*.ply") for file in path.glob(pattern)}
     names = scenes or sorted(files - {MANIFEST})
     listed = name_some(names, 5)
@@ -253,6 +269,20 @@ def _no_scene_error(path: Path) -> SceneNotFoundError:
     expected = f"sparse/0, sparse, colmap/sparse/0, {_TRANSFORMS}, poses_bounds.npy, "
     expected += "traj.txt or groundtruth.txt"
     return SceneNotFoundError(f"{expected} in {path}", found=found, fix=fix)
+
+
+def _incomplete_error(path: Path) -> SceneNotFoundError | None:
+    """Return the error for a folder that lacks one file of a format; None for others."""
+    for there, lacking, content in _INCOMPLETE:
+        if (path / there).is_file() and not (path / lacking).exists():
+            fix = f"Copy it there: it has {content}."
+            tracks = [name for name in _TRAJECTORIES if (path / name).is_file()]
+            if lacking == "groundtruth.txt" and tracks:
+                fix = f"Rename {tracks[0]}, if its lines are: time, tx ty tz, qx qy qz qw."
+            elif "poses" in content or there == "database.db":
+                fix += " Or estimate poses: splatseed sfm IMAGES -o SCENE."
+            return SceneNotFoundError(f"{lacking} beside {path / there}", found="none", fix=fix)
+    return None
 
 
 def _run_error(path: Path) -> SceneNotFoundError:
