@@ -18,7 +18,7 @@ from pathlib import Path, PurePosixPath
 from splatseed.errors import SceneFormatError
 from splatseed.findings import Finding
 from splatseed.scene import Image
-from splatseed.text import agreeing, counted, quoted
+from splatseed.text import agreeing, counted
 
 _ENCODINGS = ("utf-8", "cp1252", "gbk", "shift_jis", "big5", "euc_kr", "cp1251", "cp437")
 """Tried in this order; the first with which most files are found is used."""
@@ -104,8 +104,7 @@ def _check_names(
         raise SceneFormatError(
             f"photographs in {folder} with names in UTF-8",
             found=f"{counted(len(files), 'name')} in another encoding: {_readings(files[0])}",
-            fix="Rename the files, not the model. On Linux: convmv -r --notest -f ENCODING "
-            f"-t utf-8 {quoted(folder)}",
+            fix="Rename the files to names in UTF-8 (on Linux with convmv); the model may stay.",
         )
     unread = [name for name in names if not _is_text(found.get(name, name))]
     if unread:

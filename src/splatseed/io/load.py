@@ -17,6 +17,7 @@ from splatseed.findings import Finding, without_kinds
 from splatseed.io.bit_depth import find_white
 from splatseed.io.cleaning import clean_scene, outlier_findings
 from splatseed.io.colmap_model import find_model, nested_model, read_model, scene_model, scene_root
+from splatseed.io.copies import without_copies
 from splatseed.io.depth_files import KINDS, SUFFIXES
 from splatseed.io.depth_maps import (
     DEPTH_KIND,
@@ -132,7 +133,8 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
         fix = _TRIANGULATE if scene.images else "Choose a scene or a PLY with points."
         raise SceneNotFoundError(f"points in {path}", found="none", fix=fix)
     # seeds.npz and the manifest refer to the points as stored: restore before cleaning.
-    scene = clean_scene(with_listed_split(restore_absent(recall_seeds(scene))))
+    scene = without_copies(with_listed_split(restore_absent(recall_seeds(scene))))
+    scene = clean_scene(scene)
     scene = with_recorded_masks(scene)
     white, found = find_white([image.path for image in scene.images if image.folder])
     found += map_findings(scene.depths)
