@@ -8,7 +8,7 @@ import numpy as np
 
 from splatseed.depth.alignment import LIMITS, align_map, map_camera
 from splatseed.depth.settings import DepthSettings
-from splatseed.depthmap import DepthKind, in_scene_units
+from splatseed.depthmap import DepthKind
 from splatseed.findings import Finding
 from splatseed.io.depth_files import KINDS
 from splatseed.io.depth_maps import DEPTH_KIND, DepthFiles
@@ -41,7 +41,7 @@ def with_fitting_kind(scene: Scene, visibility: Visibility) -> tuple[Scene, list
         SceneFormatError: A map cannot be read, or differs from its image in aspect ratio.
     """
     maps = scene.depths
-    if not isinstance(maps, DepthFiles) or not len(maps) or in_scene_units(maps):
+    if not isinstance(maps, DepthFiles) or not len(maps):
         return scene, []
     images = [image for image in scene.images if image.name in maps]
     images = [images[i] for i in evenly_spaced(len(images), _MAPS)]
