@@ -193,8 +193,12 @@ def scene_root(model_dir: Path) -> Path:
         levels = 1
     elif is_model and _SPARSE.fullmatch(folders[0].parent.name):
         levels = 2
-    inside = (i for holds in (_has_image_folder, _has_photographs) for i in range(levels + 1)
-              if holds(folders[i]))  # fmt: skip
+    inside = (
+        i
+        for holds in (_has_image_folder, _has_photographs)
+        for i in range(levels + 1)
+        if levels and holds(folders[i])
+    )
     levels = next(inside, levels)
     if not levels:
         return model_dir
@@ -208,7 +212,9 @@ def _has_image_folder(folder: Path) -> bool:
 
 
 def _has_photographs(folder: Path) -> bool:
-    return any(each.suffix.lower() in _SUFFIXES for each in folder.iterdir())
+    with suppress(OSError):  # a folder above that may not be listed
+        return any(each.suffix.lower() in _SUFFIXES for each in folder.iterdir())
+    return False
 
 
 def read_colmap_scene(model_dir: StrPath) -> Scene:
@@ -217,8 +223,8 @@ def read_colmap_scene(model_dir: StrPath) -> Scene:
     root = scene_root(model_dir)
     intrinsics, images, left_out = read_model_cameras(model_dir)
     unusable = unusable_images(left_out)
-    path = model_file(model_dir, "images") or model_dir
-    images, findings = named_as_files(images, _image_folders(root), path)
+    list_path = model_file(model_dir, "images") or model_dir
+    images, findings = named_as_files(images, _image_folders(root), list_path)
     points, exact, tracks, points_path = read_model_points(model_dir)
     image_dir = _image_dir(root, images)
     findings += [*photograph_findings(images, image_dir, root), *lens_findings(images)]

@@ -18,6 +18,8 @@ from splatseed.text import agreeing, counted
 
 _PROBE = 4096
 """Bytes from the middle of a file that are compared before all of them."""
+_PART = 1 << 20
+"""Bytes that are read at a time."""
 _PLAIN = 0.02
 """Bytes per pixel of a picture that shows nothing, as which many photographs can be equal."""
 _HEADERS = 1000
@@ -69,8 +71,11 @@ def _probe(path: Path) -> bytes:
 
 
 def _digest(path: Path) -> bytes:
+    digest = hashlib.blake2b()
     with open_file(path) as file:
-        return hashlib.file_digest(file, "blake2b").digest()
+        while part := file.read(_PART):
+            digest.update(part)
+    return digest.digest()
 
 
 def _is_plain(image: Image) -> bool:

@@ -73,6 +73,8 @@ _FISHEYE = "OPENCV_FISHEYE"
 _UNDISTORTED = ("PINHOLE", "SIMPLE_PINHOLE")
 _LENS_MODELS = frozenset({"camera_model", "is_fisheye"})
 """Keys of which either states the lens model."""
+_MAX_PIXELS = 1e9
+"""Above all sizes and focal lengths, in pixels."""
 _FOCAL_LENGTHS = {a: frozenset({f"{a}_fov", f"fl_{a}", f"camera_angle_{a}"}) for a in "xy"}
 """Keys of which any states a focal length."""
 _FIX = "Correct the file, or export the scene again."
@@ -295,7 +297,7 @@ def _merged(shared: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]
     size, own_size = ([each.get(key) for key in ("w", "h")] for each in (shared, stated))
     resized = dict[str, Any]()
     if all(_is_positive(each) for each in (*size, *own_size)):
-        ratio = np.divide(own_size, size)
+        ratio = np.array(own_size, np.float64) / np.array(size, np.float64)
         resized = {f"c{axis}": ratio[i] for i, axis in enumerate("xy")}
         if abs(ratio[0] / ratio[1] - 1) <= ASPECT_SLACK:  # else cropped
             resized |= {f"fl_{axis}": ratio[i] for i, axis in enumerate("xy")}
@@ -315,7 +317,7 @@ def _merged(shared: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]
 
 def _is_positive(value: object) -> bool:
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    return number and 0 < value < math.inf  # type: ignore[operator]
+    return number and 0 < value < _MAX_PIXELS  # type: ignore[operator]
 
 
 def _lens_model(values: Mapping[str, Any]) -> str:
