@@ -8,7 +8,8 @@ import pytest
 
 from splatseed.errors import SceneFormatError
 from splatseed.io import colmap, load_scene
-from splatseed.io.colmap_model import count_images
+from splatseed.io.colmap_model import count_images, scene_root
+from splatseed.io.staging import check_output
 
 from ..findings import texts
 from .conftest import written
@@ -74,3 +75,74 @@ def test_images_of_text_are_counted(tmp_path):
     assert count_images(tmp_path) == 2
     colmap.write_images(tmp_path / "images.bin", ())
     assert count_images(tmp_path) == 0
+
+
+def test_a_model_in_sparse_itself_is_read_if_it_has_more_images(scene_dir, model_of, model):
+    model_of(0, 1)
+    written(scene_dir / "sparse", model)
+    scene = load_scene(scene_dir)
+    assert (scene.source.model_dir, scene.source.root) == (scene_dir / "sparse", scene_dir)
+    assert len(scene.images) == len(model.images)
+    assert "sparse/0 with 1 image, sparse with 4 images: sparse is read" in note_of(scene_dir)
+    small = load_scene(scene_dir / "sparse/0")
+    assert len(small.images) == 1
+    found = {each.kind: each for each in small.findings}
+    assert found["several-models"].severity == found["missing-poses"].severity == "warning"
+    assert len(found["missing-poses"].subjects) == 3
+
+
+def test_a_list_of_names_is_no_model(scene_dir):
+    (scene_dir / "images.txt").write_text("\n".join(f"{i}.jpg" for i in range(99)))
+    assert load_scene(scene_dir).source.model_dir == scene_dir / "sparse/0"
+
+
+@pytest.mark.parametrize("place", ["sparse_4/0", "sparse_12", "dense/0/sparse", "dense/sparse"])
+def test_other_places_of_models(scene_dir, model_of, model, place):
+    shutil.rmtree(scene_dir / "sparse")
+    folder = scene_dir / place
+    folder.mkdir(parents=True)
+    written(folder, model)
+    root = folder.parent if "dense" in place else scene_dir
+    if root != scene_dir:
+        (scene_dir / "images").rename(root / "images")
+    for path in (scene_dir, folder, root):
+        scene = load_scene(path)
+        assert (scene.source.root, scene.source.image_dir) == (root, root / "images")
+        assert len(scene.images) == len(model.images)
+    model_of(0, 2)
+    assert load_scene(scene_dir).source.model_dir == folder
+    assert f"{place} with 4 images" in note_of(scene_dir)
+
+
+def test_a_distorted_model_with_more_images_is_reported_and_read_on_request(scene_dir, model_of):
+    model_of(0, 1)
+    model_of(0, 1, "distorted/sparse")
+    assert not any("models" in each for each in texts(load_scene(scene_dir)))
+    larger = model_of(1, 3, "distorted/sparse")
+    assert "distorted/sparse/1 with 3 images: sparse/0 is read" in note_of(scene_dir)
+    assert f"such as {larger}." in note_of(scene_dir)
+    scene = load_scene(larger)
+    assert scene.source.image_dir == scene_dir / "images"
+    assert all(image.has_photograph for image in scene.images)
+
+
+@pytest.mark.parametrize("place", ["sparse/room", "sparse/room/sparse/0", "sparse", "sparse/0"])
+@pytest.mark.parametrize("photographs", ["images", ""])
+def test_a_folder_called_sparse_may_hold_scenes(tmp_path, scene_dir, model, place, photographs):
+    root = tmp_path / "data" / place.removesuffix("/sparse/0")
+    folder = tmp_path / "data" / place
+    folder.mkdir(parents=True)
+    written(folder, model)
+    shutil.copytree(scene_dir / "images", root / photographs, dirs_exist_ok=True)
+    if not photographs:
+        shutil.copy(next(root.glob("left/*")), root / "first.png")
+    assert scene_root(folder) == scene_root(root) == root
+    assert load_scene(folder).source.root == root
+    check_output(tmp_path / "data/out", kind="upsample", protect=[root, scene_root(root)])
+
+
+def test_a_folder_of_poses_called_sparse_belongs_to_the_scene_above(scene_dir):
+    (scene_dir / "sparse/0/preview.png").touch()
+    for folder in ("sparse", "sparse/0"):
+        assert scene_root(scene_dir / folder) == scene_dir
+    assert scene_root(scene_dir) == scene_dir

@@ -15,8 +15,15 @@ from PIL import Image as PilImage
 from splatseed.camera import Intrinsics
 from splatseed.depthmap import DepthMap
 from splatseed.errors import OutputError, ParameterError, SceneFormatError, SceneNotFoundError
-from splatseed.io import find_depths
-from splatseed.io.depth_maps import DESCRIPTION, LENSES, Undistortion, depth_folder, write_lenses
+from splatseed.io import find_depths, load_scene
+from splatseed.io.depth_maps import (
+    DESCRIPTION,
+    LENSES,
+    Undistortion,
+    depth_folder,
+    map_findings,
+    write_lenses,
+)
 from splatseed.io.load import with_depths_in
 from splatseed.io.staging import MANIFEST
 from splatseed.lens import project_rays
@@ -304,3 +311,28 @@ def test_damaged_lenses_are_named(undistorted, tmp_path):
 def test_photographs_without_distortion_leave_no_file(tmp_path):
     write_lenses(tmp_path, {"a.jpg": STRAIGHT})
     assert not (tmp_path / LENSES).exists()
+
+
+@pytest.mark.parametrize("place", ["depths", "sparse/0", "."])
+def test_graphdecos_lines_make_inverse_depth(scene_dir, place):
+    scene = load_scene(scene_dir)
+    for image in scene.images:
+        path = scene_dir / "depths" / f"{image.name.rpartition('.')[0]}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        PilImage.fromarray(np.array([[0, 1000], [2000, 65535]], np.uint16)).save(path)
+    stems = [image.name.rpartition(".")[0] for image in scene.images]
+    lines = {stem: {"scale": 2.0, "offset": 0.5} for stem in stems} | {stems[1]: {"scale": 0}}
+    lines[stems[1]] |= {"offset": 0}  # a failed fit
+    (scene_dir / place / "depth_params.json").write_text(json.dumps(lines))
+    maps = find_depths(scene, scene_dir / "depths")
+    first, second = (maps.read(image.name) for image in scene.images[:2])
+    assert first.kind == second.kind == "inverse"
+    expected = 2 * np.array([1000, 2000, 65535]) / 65536 + 0.5
+    np.testing.assert_allclose(first.values[np.isfinite(first.values)], expected, rtol=1e-6)
+    assert second.values[0, 1] == 1
+    assert [each.kind for each in map_findings(maps)] == ["depth-kind"]
+    named = find_depths(scene, scene_dir / "depths", kind="z")
+    assert named.read(scene.images[0].name).values[0, 1] == 1
+    (scene_dir / place / "depth_params.json").write_text("[1]")
+    with pytest.raises(SceneFormatError, match=r"depth_params\.json"):
+        find_depths(scene, scene_dir / "depths")

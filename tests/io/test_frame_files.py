@@ -278,3 +278,23 @@ def test_masks_that_are_named_are_found_or_told(tmp_path):
     scene = load(write(root, names))
     assert scene.masks.files == {"0.png": root / "masks/0.png"}
     assert "1 mask named in transforms.json" in " ".join(texts(scene))
+
+
+@pytest.mark.parametrize(("named", "there"), [("images", "images_4"), ("images_2", "images")])
+def test_a_folder_of_another_size_stands_in_for_an_absent_one(tmp_path, named, there):
+    frames = [
+        {"file_path": f"{named}/{i}.png", "transform_matrix": np.eye(4).tolist()} for i in range(3)
+    ]
+    (tmp_path / named).mkdir()  # empty
+    (tmp_path / there).mkdir()
+    for i in range(3):
+        PilImage.new("RGB", (8, 6), (i, 0, 0)).save(tmp_path / there / f"{i}.png")
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps({"fl_x": 40, "w": 32, "h": 24, "frames": frames}))
+    scene = load_scene(tmp_path, require_points=False)
+    assert scene.source.image_dir == tmp_path / there
+    first = scene.images[0]
+    assert (first.name, first.lens.width, first.K[0, 0]) == ("0.png", 8, 10)
+    assert "moved-photographs" in {each.kind for each in scene.findings}
+    (tmp_path / named / "0.png").touch()
+    assert load_scene(tmp_path, require_points=False).source.image_dir == tmp_path / named

@@ -186,3 +186,24 @@ def test_a_point_beyond_all_distances_is_left_out(rng):
     assert texts(clean) == ("1 point is beyond 1e15 and was left out.",)
     assert len(clean.points) == 499
     assert np.abs(upsample(cloud, "linear", num_points=800).xyz[500:]).max() < 10
+
+
+@pytest.mark.parametrize(
+    ("there", "lacking", "advice"),
+    [
+        (["rgb.txt", "depth.txt"], "groundtruth.txt", "has the poses"),
+        (["rgb.txt", "KeyFrameTrajectory.txt"], "groundtruth.txt", "Rename KeyFrameTrajectory.txt"),
+        (["groundtruth.txt"], "rgb.txt", "has the photographs"),
+        (["transforms_test.json"], "transforms_train.json", "frames to train on"),
+        (["cam_params.json"], "traj.txt", "has the poses"),
+        (["odometry.csv"], "rgb.mp4", "Stray Scanner"),
+        (["database.db"], "sparse/0", "splatseed sfm"),
+    ],
+)
+def test_the_file_that_a_format_lacks_is_named(tmp_path, there, lacking, advice):
+    for name in there:
+        (tmp_path / name).touch()
+    with pytest.raises(SceneNotFoundError) as error:
+        load_scene(tmp_path)
+    assert error.value.expected == f"{lacking} beside {tmp_path / there[0]}"
+    assert advice in error.value.fix

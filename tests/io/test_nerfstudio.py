@@ -315,3 +315,53 @@ def test_blenders_files_are_one_scene_and_so_is_its_output(layout, tmp_path, rng
     np.testing.assert_allclose(*pixels, rtol=1e-3, atol=1e-2)
     assert [each.masks.alpha for each in (scene, again)] == [False, False]  # black, not masked
     assert not [each for each in texts(scene) if "missing" in each or "outside" in each]
+
+
+SHARED = {"w": 200, "h": 100, "fl_x": 150.0, "fl_y": 160.0, "cx": 90.0, "cy": 60.0, "k1": 0.1}
+
+
+@pytest.mark.parametrize(
+    ("shared", "own", "kind", "params"),
+    [
+        ({}, {}, "OPENCV", (150, 160, 90, 60, 0.1, 0, 0, 0)),
+        ({}, {"camera_angle_x": math.pi / 2}, "OPENCV", (100, 100, 90, 60, 0.1, 0, 0, 0)),
+        ({}, {"x_fov": 90}, "OPENCV", (100, 100, 90, 60, 0.1, 0, 0, 0)),
+        ({}, {"fl_x": 120, "fl_y": None}, "OPENCV", (120, 120, 90, 60, 0.1, 0, 0, 0)),
+        ({}, {"w": 100, "h": 50}, "OPENCV", (75, 80, 45, 30, 0.1, 0, 0, 0)),
+        ({}, {"w": 100, "h": 100}, "OPENCV", (150, 160, 45, 60, 0.1, 0, 0, 0)),  # cropped
+        ({}, {"w": 100, "h": 50, "cx": 50, "fl_x": 8}, "OPENCV", (8, 8, 50, 30, 0.1, 0, 0, 0)),
+        ({}, {"k1": 0.2, "p1": 0.3}, "OPENCV", (150, 160, 90, 60, 0.2, 0, 0.3, 0)),
+        ({}, {"camera_model": "PINHOLE"}, "PINHOLE", (150, 160, 90, 60)),
+        ({}, {"is_fisheye": True}, "OPENCV_FISHEYE", (150, 160, 90, 60, 0, 0, 0, 0)),
+        ({"is_fisheye": True}, {"is_fisheye": False}, "PINHOLE", (150, 160, 90, 60)),
+        ({"is_fisheye": True}, {"camera_model": "OPENCV"}, "PINHOLE", (150, 160, 90, 60)),
+        ({"camera_model": "RADIAL"}, {"is_fisheye": False}, "OPENCV", (150, 160, 90, 60, 0.1)),
+        ({"fl_x": None, "x_fov": 90}, {"fl_x": 9}, "OPENCV", (9, 9, 90, 60, 0.1, 0, 0, 0)),
+    ],
+)
+def test_a_frame_replaces_what_it_states_in_any_way(content, tmp_path, shared, own, kind, params):
+    content = {"frames": content["frames"], **SHARED, **shared}
+    content["frames"][0] |= own
+    cameras = {im.name: im.intrinsics for im in _images(content, tmp_path)}
+    first, *others = cameras.values()
+    assert first.model == kind
+    np.testing.assert_allclose(first.params[: len(params)], params)
+    assert not any(first.params[len(params) :])
+    del content["frames"][0]
+    assert others == [im.intrinsics for im in _images(content, tmp_path)]
+
+
+def _images(content, folder):
+    images = read_transforms(write_json(folder / "t.json", content)).images
+    return [replace(im, intrinsics=replace(im.intrinsics, camera_id=1)) for im in images]
+
+
+def test_an_output_states_each_frames_intrinsics_where_they_differ(content, tmp_path, model):
+    content["frames"][0]["camera_angle_x"] = math.pi / 2
+    path = write_json(tmp_path / "in/transforms.json", content)
+    write_ply(path.parent / "sparse_pc.ply", model.points)
+    write_scene(load_scene(path), tmp_path / "out")
+    out = json.loads((tmp_path / "out/transforms.json").read_text())
+    assert "fl_x" not in out
+    assert "cx" in out
+    assert [frame["fl_x"] for frame in out["frames"][:2]] == [pytest.approx(320), 500]

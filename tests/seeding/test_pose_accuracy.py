@@ -12,6 +12,7 @@ from splatseed.camera import quat_from_rotation
 from splatseed.pointcloud import PointCloud
 from splatseed.seeding import pose_accuracy as module
 from splatseed.seeding.pose_accuracy import estimate_pose_error
+from splatseed.seeding.poses import check_poses
 
 
 def _posed(scene, poses):
@@ -73,3 +74,17 @@ def test_the_error_is_in_pixels_of_the_size_of_stereo(room, poses, monkeypatch):
         assert error.exact == (round(error.px, 2) <= 0.5) == (not error.findings)
         assert f"{error.px:.2g} px" in str(error)
         assert f"at {error.side} px a side" in str(error)
+
+
+@pytest.mark.parametrize("factor", [2, 4])
+def test_photographs_smaller_than_their_cameras_are_measured_at_their_size(room, poses, factor):
+    scene = _posed(room, poses)
+    lens = scene.images[0].intrinsics
+    larger = lens.resized(factor * lens.width, factor * lens.height)
+    images = tuple(replace(image, intrinsics=larger) for image in scene.images)
+    of_larger = scene.replace(images=images, intrinsics=(larger,))
+    assert check_poses(of_larger, of_larger.images) == check_poses(scene, scene.images)
+    error = estimate_pose_error(of_larger, of_larger.images)
+    assert error == estimate_pose_error(scene, scene.images)
+    assert error.exact
+    assert error.side == 160

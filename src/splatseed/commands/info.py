@@ -182,7 +182,16 @@ def _read(options: Options) -> Scene:
     if options.depth is None:
         return scene
     kind, scale = options.depth_kind, options.depth_scale
-    return with_depths_in(scene, options.depth, kind=kind, scale=scale)
+    return _with_kind(with_depths_in(scene, options.depth, kind=kind, scale=scale))
+
+
+def _with_kind(scene: Scene) -> Scene:
+    """Read depth maps as the kind that fits the points, unless it is stated."""
+    from splatseed.depth.kinds import with_fitting_kind
+    from splatseed.photos.visibility import find_visibility
+
+    scene, findings = with_fitting_kind(scene, find_visibility(scene))
+    return scene.replace(findings=(*scene.findings, *findings))
 
 
 def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, Alignment]:

@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from splatseed.depth.alignment import lift_pixels, reject_other_units, reject_outliers
 from splatseed.depth.comparison import choose_neighbors, find_support, synchronize_scales
+from splatseed.depth.kinds import with_fitting_kind
 from splatseed.depth.settings import PER_POINT, DepthSettings
 from splatseed.depth.thinning import spread_evenly
 from splatseed.depth.views import DepthView, read_view
@@ -87,6 +88,8 @@ def lift(
     settings = _settings_without_points(scene, settings)
     scene, center = _centered(scene)
     visibility, findings = find_visibility(scene), list[Finding]()
+    if settings.align:
+        scene, findings = with_fitting_kind(scene, visibility)
     images = _images_with_maps(scene, settings, findings)
     factor = OVERSAMPLING.plain
     if settings.compares_views or settings.spread:

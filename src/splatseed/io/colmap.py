@@ -80,6 +80,7 @@ def read_images(
 ) -> tuple[Image, ...]:
     """Read ``images.bin`` or ``images.txt``, in file order.
 
+    Bytes of a name that are not UTF-8 become surrogates, as in ``os.fsdecode``.
     Images whose pose is not finite, or whose camera is in ``unusable``, are moved to ``unusable``
     by name; if that is None, they raise.
     """
@@ -326,7 +327,7 @@ def _text_cameras(path: Path) -> Iterator[tuple[Any, ...]]:
 
 def _text_images(path: Path) -> Iterator[tuple[Any, ...]]:
     """Yield images as ``_binary_images`` does; each has a second line with its features."""
-    lines = numbered_lines(path)
+    lines = numbered_lines(path, errors="surrogateescape")  # in names; numbers are checked below
     for where, line in lines:
         if not is_data(line):
             continue

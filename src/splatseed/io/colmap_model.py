@@ -7,19 +7,22 @@ on, which are not ordered by size: the one with the most images is read.
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Sequence
 from contextlib import suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from jaxtyping import Float64
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneNotFoundError, SplatseedError
-from splatseed.findings import Finding
+from splatseed.findings import Finding, Severity
 from splatseed.io.camera_records import Unusable, check_enough, unusable_findings, unusable_images
 from splatseed.io.colmap import MIN_IMAGE_BYTES, read_cameras, read_images, read_points3d
-from splatseed.io.files import StrPath, is_data, numbered_lines, open_file
+from splatseed.io.files import StrPath, is_data, is_hidden, numbered_lines, open_file
+from splatseed.io.image_names import named_as_files
 from splatseed.io.origin import recentered
 from splatseed.io.photograph import lens_findings
 from splatseed.io.photograph_checks import photograph_findings
@@ -33,17 +36,23 @@ IMAGE_DIRS = ("images", "images_2", "images_4", "images_8", "image", "input")
 _MODEL_FILES = ("cameras", "images", "points3D")
 _POINT_SUFFIXES = (".bin", ".txt", ".ply")
 _UNKNOWN = -1
+_SPARSE = re.compile(r"sparse(_\d+)?")
+"""Names of folders of models; InstantSplat counts the views in them."""
+_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp"})
 
 
 def scene_model(root: Path) -> Path | None:
-    """Find the model of a scene folder, of ``sparse``, or of a folder of numbered models."""
-    largest = largest_model(root / "sparse")
-    return largest or find_model(root / "sparse", root) or largest_model(root)
+    """Find the model of a scene folder, of ``sparse``, or of a folder of numbered models.
+
+    Models elsewhere in a scene folder count if they have more images than those there.
+    """
+    own = own_models(root)
+    return next(iter(_by_images([*own, *_nested_models(root)])), None) if own else None
 
 
 def nested_model(root: Path) -> Path | None:
-    """Find the model in ``colmap/sparse``, nerfstudio's place for it."""
-    return next(iter(models_in(root / "colmap/sparse")), None)
+    """Find the model in one of the folders of a scene folder that programs name otherwise."""
+    return next(iter(_by_images(_nested_models(root))), None)
 
 
 def models_in(folder: Path) -> list[Path]:
@@ -51,15 +60,34 @@ def models_in(folder: Path) -> list[Path]:
     return ranked_models(folder) or [each for each in (folder,) if find_model(each)]
 
 
-def largest_model(folder: Path) -> Path | None:
-    """Return the numbered model with the most images; the first of equals."""
-    return next(iter(ranked_models(folder)), None)
+def own_models(root: Path) -> list[Path]:
+    """Return the models in ``sparse`` and in the folder itself, numbered ones first."""
+    models = numbered_models(root / "sparse")
+    models += [each for each in (root / "sparse", root) if find_model(each)]
+    return models + numbered_models(root)
+
+
+def _nested_models(root: Path) -> list[Path]:
+    """Return the models of nerfstudio, InstantSplat and COLMAP's undistortion."""
+    counted_views = sorted(each for each in root.glob("sparse_*") if _SPARSE.fullmatch(each.name))
+    dense = [each / "sparse" for each in sorted(root.glob("dense/[0-9]*"))]
+    models = list[Path]()
+    for folder in (root / "colmap/sparse", *counted_views, *dense, root / "dense/sparse"):
+        models += [*numbered_models(folder), *([folder] if find_model(folder) else [])]
+    return models
+
+
+def _by_images(models: Sequence[Path]) -> list[Path]:
+    """Sort models by their number of images, most first; one that is no model counts as empty."""
+    if len(models) < 2:
+        return list(models)
+    sizes = {each: count_images(each) if model_file(each, "cameras") else 0 for each in models}
+    return sorted(models, key=lambda each: -max(sizes[each], 0))
 
 
 def ranked_models(folder: Path) -> list[Path]:
     """Return a folder's numbered models, most images first."""
-    models = numbered_models(folder)
-    return models if len(models) < 2 else sorted(models, key=lambda each: -count_images(each))
+    return _by_images(numbered_models(folder))
 
 
 def numbered_models(folder: Path) -> list[Path]:
@@ -88,7 +116,7 @@ def count_images(model_dir: Path) -> int:
 
 def _count_lines(path: Path) -> int:
     """Count the images of ``images.txt``: two lines each, of which the second may be blank."""
-    count, lines = 0, numbered_lines(path)
+    count, lines = 0, numbered_lines(path, errors="replace")
     for _, line in lines:
         if is_data(line):
             count += 1
@@ -96,20 +124,35 @@ def _count_lines(path: Path) -> int:
     return count
 
 
-def read_model(model_dir: Path) -> Scene:
-    """Read a model as a scene; warn if it is one of several."""
-    scene, models = read_colmap_scene(model_dir), numbered_models(model_dir.parent)
-    if len(models) < 2 or not model_dir.name.isdecimal():
+def read_model(model_dir: Path, folder: Path | None = None) -> Scene:
+    """Read a model as a scene, and report the other models of the scene's folder, or of another."""
+    scene, root = read_colmap_scene(model_dir), scene_root(model_dir)
+    places = dict.fromkeys([root, *([] if folder is None else [folder])])
+    found = [each for place in places for each in (*own_models(place), *_nested_models(place))]
+    counts = {each: count_images(each) for each in dict.fromkeys(map(_absolute, found))}
+    read = _absolute(model_dir)
+    count = counts.setdefault(read, count_images(read))
+    for each in numbered_models(root / "distorted/sparse"):  # of the photographs as taken
+        if count_images(each) > count:
+            counts[_absolute(each)] = count_images(each)
+    if len(counts) < 2:
         return scene
-    counts = {each.name: count_images(each) for each in models}
+    above = Path(os.path.commonpath([each.parent for each in counts]))
+    names = {each: each.relative_to(above).as_posix() for each in counts}
     shown = [
-        f"{name} with {counted(count, 'image') if count != _UNKNOWN else 'damaged images'}"
-        for name, count in counts.items()
+        f"{names[each]} with {counted(num, 'image') if num != _UNKNOWN else 'damaged images'}"
+        for each, num in counts.items()
     ]
-    other = next(each for each in ranked_models(model_dir.parent) if each.name != model_dir.name)
-    listed = f"{model_dir.parent} has {len(models)} models, {', '.join(shown)}"
-    note = f"{listed}: {model_dir.name} is read. To read another, pass its path, such as {other}."
-    return scene.replace(findings=(*scene.findings, Finding("several-models", note, "info")))
+    other = max((each for each in counts if each != read), key=lambda each: counts[each])
+    text = f"{above} has {len(counts)} models, {', '.join(shown)}: {names[read]} is read."
+    fix = f"To read another, pass its path, such as {other}."
+    severity: Severity = "warning" if counts[other] > count else "info"
+    finding = Finding("several-models", text, severity, fix=fix)
+    return scene.replace(findings=(*scene.findings, finding))
+
+
+def _absolute(path: Path) -> Path:
+    return Path(os.path.abspath(path))  # noqa: PTH100  (resolve would follow links)
 
 
 def find_model(*folders: Path) -> Path | None:
@@ -144,15 +187,39 @@ def _other_points(model_dir: Path, root: Path, read: Path, points: PointCloud) -
 
 
 def scene_root(model_dir: Path) -> Path:
-    """Return the scene folder of a model: without ``sparse/0`` or ``sparse``, and ``colmap``."""
-    parts = model_dir.absolute().parts
-    levels = 1 if parts[-1] == "sparse" else 2 if parts[-2:-1] == ("sparse",) else 0
+    """Return the scene folder of a model: without ``sparse/0`` or ``sparse``, and ``colmap``.
+
+    A folder of these names that holds photographs is a scene itself.
+    """
+    folders = [model_dir.absolute(), *model_dir.absolute().parents]
+    is_model = find_model(model_dir) is not None
+    levels = 0
+    if _SPARSE.fullmatch(folders[0].name) and (is_model or numbered_models(model_dir)):
+        levels = 1
+    elif is_model and _SPARSE.fullmatch(folders[0].parent.name):
+        levels = 2
+    inside = (
+        i
+        for holds in (_has_image_folder, _has_photographs)
+        for i in range(levels + 1)
+        if levels and holds(folders[i])
+    )
+    levels = next(inside, levels)
     if not levels:
         return model_dir
-    above = model_dir.absolute().parents[levels - 1]
-    levels += above.name == "colmap" and not any((above / name).is_dir() for name in IMAGE_DIRS)
+    levels += folders[levels].name == "colmap" and not _has_image_folder(folders[levels])
     named = model_dir if len(model_dir.parts) >= levels else model_dir.absolute()
     return named.parents[levels - 1]
+
+
+def _has_image_folder(folder: Path) -> bool:
+    return any((folder / name).is_dir() for name in IMAGE_DIRS)
+
+
+def _has_photographs(folder: Path) -> bool:
+    with suppress(OSError):  # a folder above that may not be listed
+        return any(each.suffix.lower() in _SUFFIXES for each in folder.iterdir())
+    return False
 
 
 def read_colmap_scene(model_dir: StrPath) -> Scene:
@@ -161,10 +228,13 @@ def read_colmap_scene(model_dir: StrPath) -> Scene:
     root = scene_root(model_dir)
     intrinsics, images, left_out = read_model_cameras(model_dir)
     unusable = unusable_images(left_out)
+    list_path = model_file(model_dir, "images") or model_dir
+    images, findings = named_as_files(images, _image_folders(root), list_path)
     points, exact, tracks, points_path = read_model_points(model_dir)
     image_dir = _image_dir(root, images)
-    findings = [*photograph_findings(images, image_dir, root), *lens_findings(images)]
+    findings += [*photograph_findings(images, image_dir, root), *lens_findings(images)]
     findings += unusable_findings(unusable, len(images))
+    findings += _unposed_findings(root, image_dir, images)
     findings += _other_points(model_dir, root, points_path, points)
     if (root / "transforms.json").is_file():
         text = f"{root / 'transforms.json'} exists too; pass its path to read it instead."
@@ -188,17 +258,51 @@ def read_colmap_scene(model_dir: StrPath) -> Scene:
 def _image_dir(root: Path, images: Sequence[Image]) -> Path | None:
     """Return the first known folder with half of the images, else that with most, or the first.
 
+    Those beside a folder of graphdeco's distorted model, or of a numbered one, are searched too.
+
     Not the first with all: where one lacks a photograph, the next may hold reduced copies or, as
     graphdeco's ``input``, photographs with distortion that the model's cameras do not have.
     """
-    folders = [root / name for name in IMAGE_DIRS if (root / name).is_dir()]
     counts_by_folder = dict[Path, int]()
-    for folder in (*folders, root):
+    folders = _image_folders(root)
+    for folder in folders:
         counts_by_folder[folder] = sum((folder / image.name).is_file() for image in images)
         if 2 * counts_by_folder[folder] >= len(images) > 0:
             return folder
     best = max(counts_by_folder, key=lambda folder: counts_by_folder[folder])
-    return best if counts_by_folder[best] else next(iter(folders), None)
+    return best if counts_by_folder[best] else next((f for f in folders if root in f.parents), None)
+
+
+def _image_folders(root: Path) -> list[Path]:
+    """Return the folders that may hold a scene's photographs, most likely first."""
+    above: list[Path] = []
+    if root.name == "distorted" or root.name.isdecimal():
+        above = [root.absolute().parent / name for name in ("input", *IMAGE_DIRS)]
+    inside = [root / name for name in IMAGE_DIRS]
+    return [each for each in (*inside, root, *above) if each.is_dir()]
+
+
+def _unposed_findings(root: Path, image_dir: Path | None, images: Sequence[Image]) -> list[Finding]:
+    """Report photographs that are in the images' folders, but not in the model."""
+    if image_dir is None or image_dir == root or not images:
+        return []
+    names = {image.name for image in images}
+    folders = {PurePosixPath(name).parent for name in names}
+    there = {
+        str(folder / each.name)
+        for folder in folders
+        if (image_dir / folder).is_dir()
+        for each in (image_dir / folder).iterdir()
+        if each.suffix.lower() in _SUFFIXES and not is_hidden(each.name)
+    }
+    posed = there & names
+    if not posed or posed == there:
+        return []
+    text = f"{len(posed):,} of {len(there):,} photographs in {image_dir} have a pose"
+    text += "; the others are left out."
+    severity: Severity = "info" if 2 * len(posed) >= len(there) else "warning"
+    subjects = tuple(sorted(there - posed))
+    return [Finding("missing-poses", text, severity, subjects)]
 
 
 def read_model_cameras(

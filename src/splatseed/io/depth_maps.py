@@ -48,8 +48,11 @@ DESCRIPTION = "depths.json"
 """The file that describes the maps of a folder."""
 LENSES = "distorted.json"
 """The file of the original lenses, in the folder of an undistorted scene."""
+LINES = "depth_params.json"
+"""Graphdeco's file of scales and offsets, by image name without suffix, beside a COLMAP model."""
 
 DISTORTED_MAPS, WITHOUT_CONFIDENCE = "distorted-depth-maps", "depth-maps-without-confidence"
+DEPTH_KIND = "depth-kind"
 """Kinds of findings about maps."""
 
 _INTEGER_SCALE = 1000.0
@@ -57,6 +60,8 @@ _INTEGER_SCALE = 1000.0
 _NO_HIT = 1e9
 """Values from here on mean that a renderer's ray hit nothing; Blender writes 1e10."""
 _SATURATED = 65535
+_LINE_DIVISOR = 2.0**16
+"""Of stored values, whatever their bits, before a line applies."""
 _FOLDERS = ("", "stereo/depth_maps", "depth_maps", "results", "depths", "depth", "keyframes/depth")
 """Subfolders searched for maps; the first with a match is used."""
 _FRAME = re.compile(r"frame_?(\d+)", re.IGNORECASE)
@@ -106,6 +111,9 @@ class DepthFiles:
     """Files of the maps' confidence by image name; of an image without one it is unknown."""
     in_scene_units: bool = False
     """Whether the maps come with a capture and share the unit of its poses."""
+    lines: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Scale and offset from integers / 65536 to inverse depth in scene units, by image name
+    (graphdeco's). Where there are any, the default kind is inverse depth."""
 
     def __contains__(self, name: object) -> bool:
         return name in self.paths
@@ -133,10 +141,14 @@ class DepthFiles:
             fix = "Skip this image."
             raise SceneNotFoundError(f"a depth map of {name}", found="none", fix=fix)
         stored = read_stored(path)
-        kind, is_integer = self.kind or "z", stored.dtype.kind in "ui"
+        default: DepthKind = "inverse" if self.lines else "z"
+        kind, is_integer = self.kind or default, stored.dtype.kind in "ui"
         divisor = self.scale or (_INTEGER_SCALE if is_integer else 1.0)
+        line = self.lines.get(name) if kind == "inverse" else None
         with np.errstate(over="ignore", invalid="ignore"):  # becomes infinite, and so NaN
             values: np.ndarray = (stored / np.float64(divisor)).astype(np.float32)
+            if line is not None:
+                values = (line[0] * (stored / _LINE_DIVISOR) + line[1]).astype(np.float32)
             known = (np.abs(values) < _NO_HIT) & ((values > 0) | (kind == "inverse"))
         if is_integer and kind == "inverse":
             known &= stored != 0
@@ -177,8 +189,28 @@ def match_by_name(scene: Scene, root: Path) -> DepthFiles | None:
         if _CAPTURED.fullmatch(example.stem) and example.suffix.lower() == ".png":
             camera = camera_file(folder, 2)
             scale = read_capture_scale(camera) if camera else None
-        return DepthFiles(paths, scale=scale, confidences=confidences)
+        lines = _find_lines(scene, folder, paths)
+        return DepthFiles(paths, scale=scale, confidences=confidences, lines=lines)
     return None
+
+
+def _find_lines(
+    scene: Scene, folder: Path, paths: Mapping[str, Path]
+) -> dict[str, tuple[float, float]]:
+    """Find the lines of graphdeco's inverse depth maps, without those of failed fits."""
+    model, root = scene.source.model_dir, scene.source.root
+    places = [place for place in (folder, folder.parent, model, root) if place is not None]
+    path = next((place / LINES for place in places if (place / LINES).is_file()), None)
+    if path is None or any(each.suffix.lower() != ".png" for each in paths.values()):
+        return {}
+    content = read_json(path)
+    with translate_errors(path, "a scale and an offset per image", fix="Correct it."):
+        lines = {
+            name: (float(line["scale"]), float(line["offset"]))
+            for name in paths
+            if (line := content.get(name.rpartition(".")[0])) is not None
+        }
+    return {name: line for name, line in lines.items() if 0 < line[0] < np.inf > abs(line[1])}
 
 
 def find_confidences(paths: Mapping[str, Path]) -> dict[str, Path]:
@@ -247,7 +279,7 @@ def _read_lenses(path: Path) -> dict[str, Intrinsics]:
 
 
 def map_findings(maps: object) -> list[Finding]:
-    """Report maps that are undistorted, and of those without a confidence among others."""
+    """Report how maps are read, and those without a confidence among others."""
     if not isinstance(maps, DepthFiles):
         return []
     findings = []
@@ -256,6 +288,9 @@ def map_findings(maps: object) -> list[Finding]:
             "Depth maps are those of the photographs before undistortion, and are undistorted on "
         )
         findings.append(Finding(DISTORTED_MAPS, f"{text}reading.", "info"))
+    if maps.lines and maps.kind in (None, "inverse"):
+        text = f"Depth maps are read as inverse depth: {LINES} has their scales and offsets."
+        findings.append(Finding(DEPTH_KIND, text, "info"))
     return findings + _without_confidence(maps)
 
 

@@ -217,11 +217,14 @@ def read_npy(file: IO[bytes], max_bytes: float = np.inf) -> np.ndarray:
     return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran_order else "C")
 
 
-def numbered_lines(path: Path) -> Iterator[tuple[str, str]]:
-    """Yield "PATH, line N" and the text of each line of a UTF-8 file, without a byte order mark."""
+def numbered_lines(path: Path, errors: str = "strict") -> Iterator[tuple[str, str]]:
+    """Yield "PATH, line N" and the text of each line of a UTF-8 file, without a byte order mark.
+
+    ``errors`` is that of ``bytes.decode``.
+    """
     raw = read_bytes(path)
     try:
-        text = raw.decode("utf-8-sig")
+        text = raw.decode("utf-8-sig", errors)
     except UnicodeDecodeError as error:
         number = raw.count(b"\n", 0, error.start) + 1
         found = repr(raw[error.start : error.end])
@@ -293,15 +296,11 @@ class ByteReader:
         self.finish()
 
     def text(self) -> str:
-        """Read a NUL-terminated UTF-8 string."""
+        """Read a NUL-terminated UTF-8 string; other bytes become surrogates."""
         end = self.data.find(b"\0", self.offset)
         if end < 0:
             raise self.error("a name ended by a zero byte", "the end of the file")
-        raw = self.data[self.offset : end]
-        try:
-            text = raw.decode("utf-8")
-        except UnicodeDecodeError:
-            raise self.error("a name in UTF-8", beginning(raw, 80)) from None
+        text = self.data[self.offset : end].decode("utf-8", "surrogateescape")
         self.offset = end + 1
         return text
 

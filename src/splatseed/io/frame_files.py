@@ -1,14 +1,15 @@
 r"""Photographs, masks and depth maps that the frames of a ``transforms.json`` name.
 
 A name is tried as written first. For files from another computer, \\ and / are equal, as are %20
-and a space; a missing suffix, other case or another parent folder are allowed. Promise: a file of
-another name is never used.
+and a space, and both forms of an umlaut in Unicode; a missing suffix, other case or another parent
+folder are allowed. Promise: a file of another name is never used.
 """
 
 from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -92,6 +93,8 @@ class FrameFiles:
         ends = [root.joinpath(*parts[start:]) for start in range(len(parts))]
         if moved or len(parts) == 1:  # else the folder may distinguish files of one name
             ends += [root / folder / parts[-1] for folder in folders if parts]
+        if suffixes and len(parts) > 1 and not _has_files(root / parts[0]):
+            ends += [root.joinpath(each, *parts[1:]) for each in _resized_folders(parts[0])]
         for end in map(absolute, ends):
             if near := self._near(end, suffixes):
                 return Found(near, relocated=True)
@@ -115,10 +118,24 @@ class FrameFiles:
         return None
 
 
+def _has_files(folder: Path) -> bool:
+    return folder.is_dir() and any(folder.iterdir())
+
+
+def _resized_folders(name: str) -> list[str]:
+    """Return the names of folders that hold the photographs of another at other sizes."""
+    plain = re.sub(r"_[248]\Z", "", name)
+    return [
+        each for each in (plain, *(f"{plain}_{factor}" for factor in (2, 4, 8))) if each != name
+    ]
+
+
 def _spellings(name: str) -> Iterator[str]:
     yield name
     yield name.replace("\\", "/")
-    yield unquote(name.replace("\\", "/"))
+    plain = unquote(name.replace("\\", "/"))
+    yield from (unicodedata.normalize(form, plain) for form in ("NFC", "NFD"))
+    yield plain
 
 
 class Frame(NamedTuple):

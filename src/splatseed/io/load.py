@@ -17,8 +17,10 @@ from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundErro
 from splatseed.findings import Finding, without_kinds
 from splatseed.io.cleaning import clean_scene, outlier_findings
 from splatseed.io.colmap_model import find_model, nested_model, read_model, scene_model, scene_root
+from splatseed.io.copies import without_copies
 from splatseed.io.depth_files import KINDS, SUFFIXES
 from splatseed.io.depth_maps import (
+    DEPTH_KIND,
     DISTORTED_MAPS,
     WITHOUT_CONFIDENCE,
     DepthFiles,
@@ -50,7 +52,7 @@ from splatseed.io.stray import is_stray, read_stray
 from splatseed.scene import Scene, SceneSource
 from splatseed.text import name_some, quoted
 
-_TRANSFORMS = "transforms.json"
+_TRANSFORMS, _BLENDER = "transforms.json", "transforms_train.json"
 _MAX_LEVELS_UP = 3
 """How many parent folders of a file are searched for its scene."""
 _SCAN_SUFFIXES = frozenset({".las", ".laz", ".e57", ".pcd", ".xyz", ".asc", ".pts", ".glb"})
@@ -74,6 +76,19 @@ READERS = (
     Reader("Stray Scanner's rgb.mp4 with odometry.csv", is_stray, read_stray),
 )
 """Tried in this order, after COLMAP models and transforms.json."""
+_INCOMPLETE = (
+    ("rgb.txt", "groundtruth.txt", "the poses, each line: time, tx ty tz, qx qy qz qw"),
+    ("groundtruth.txt", "rgb.txt", "the photographs, each line: time, path"),
+    ("transforms_test.json", _BLENDER, "the frames to train on"),
+    ("transforms_val.json", _BLENDER, "the frames to train on"),
+    ("cam_params.json", "traj.txt", "the poses, each line: 16 numbers of world_from_cam"),
+    ("odometry.csv", "rgb.mp4", "the photographs of Stray Scanner's recording"),
+    ("camera_matrix.csv", "odometry.csv", "the poses of Stray Scanner's recording"),
+    ("database.db", "sparse/0", "the model that COLMAP's mapper makes of its database"),
+)
+"""Files that a folder has, the file that it then needs, and its content."""
+_TRAJECTORIES = ("CameraTrajectory.txt", "KeyFrameTrajectory.txt")
+"""ORB-SLAM's files of poses, of the form of ``groundtruth.txt``."""
 _TRIANGULATE = (
     "Method auto needs none: splatseed upsample SCENE -o OUT. Or make points with: splatseed sfm"
     " IMAGES --poses-from SCENE -o OUT."
@@ -127,7 +142,8 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
         fix = _TRIANGULATE if scene.images else "Choose a scene or a PLY with points."
         raise SceneNotFoundError(f"points in {path}", found="none", fix=fix)
     # seeds.npz and the manifest refer to the points as stored: restore before cleaning.
-    scene = clean_scene(with_listed_split(restore_absent(recall_seeds(scene))))
+    scene = without_copies(with_listed_split(restore_absent(recall_seeds(scene))))
+    scene = clean_scene(scene)
     scene = with_recorded_masks(scene)
     white, found = find_white([image.path for image in scene.images if image.folder])
     found += map_findings(scene.depths)
@@ -174,13 +190,13 @@ def _reader(folder: Path) -> Callable[[], Scene] | None:
     if read_manifest(folder).get("format") == "both" and (folder / _TRANSFORMS).is_file():
         return partial(read_transforms_scene, folder / _TRANSFORMS)  # it says more: masks, depth
     if (model := scene_model(folder)) is not None:
-        return partial(read_model, model)
+        return partial(read_model, model, folder)
     if (folder / _TRANSFORMS).is_file():
         return partial(read_transforms_scene, folder / _TRANSFORMS)
     if is_blender(folder):
         return partial(read_blender, folder)
     if (nested := nested_model(folder)) is not None:
-        return partial(read_model, nested)
+        return partial(read_model, nested, folder)
     found = (partial(each.read, folder) for each in READERS if each.recognises(folder))
     return next(found, None)
 
@@ -247,6 +263,9 @@ def _no_scene_error(path: Path) -> SceneNotFoundError:
     if read_manifest(path).get("command") == "train":
         return _run_error(path)
     scenes = [child.name for child in sorted(path.iterdir()) if is_scene(child)]
+    incomplete = None if scenes else _incomplete_error(path)
+    if incomplete is not None:
+        return incomplete
     files = {file.name for pattern in ("*.json", "*.ply") for file in path.glob(pattern)}
     names = scenes or sorted(files - {MANIFEST})
     listed = name_some(names, 5)
@@ -261,6 +280,20 @@ def _no_scene_error(path: Path) -> SceneNotFoundError:
     *first, last = (each.files for each in READERS)
     expected = ", ".join(["sparse/0, sparse, colmap/sparse/0", _TRANSFORMS, *first])
     return SceneNotFoundError(f"{expected} or {last} in {path}", found=found, fix=fix)
+
+
+def _incomplete_error(path: Path) -> SceneNotFoundError | None:
+    """Return the error for a folder that lacks one file of a format; None for others."""
+    for there, lacking, content in _INCOMPLETE:
+        if (path / there).is_file() and not (path / lacking).exists():
+            fix = f"Copy it there: it has {content}."
+            tracks = [name for name in _TRAJECTORIES if (path / name).is_file()]
+            if lacking == "groundtruth.txt" and tracks:
+                fix = f"Rename {tracks[0]}, if its lines are: time, tx ty tz, qx qy qz qw."
+            elif "poses" in content or there == "database.db":
+                fix += " Or estimate poses: splatseed sfm IMAGES -o SCENE."
+            return SceneNotFoundError(f"{lacking} beside {path / there}", found="none", fix=fix)
+    return None
 
 
 def _run_error(path: Path) -> SceneNotFoundError:
@@ -313,7 +346,8 @@ def find_depths(
             found="none" if name else "a scene without images",
             fix="Give maps the names of their images, subfolders included, with another suffix.",
         )
-    maps = replace(maps, kind=kind or maps.kind, scale=scale or maps.scale)
+    lines = {} if scale else maps.lines  # an explicit scale is that of plain values
+    maps = replace(maps, kind=kind or maps.kind, scale=scale or maps.scale, lines=lines)
     maps = fitted_to_undistorted(scene, maps)
     own = scene.depths
     if isinstance(own, DepthFiles) and _same_maps(own, maps):
@@ -333,7 +367,7 @@ def with_depths_in(
 
 def _with_maps(scene: Scene, maps: DepthFiles | None) -> Scene:
     """Attach maps, with findings about them in place of those about the scene's own."""
-    kept = without_kinds(scene.findings, DISTORTED_MAPS, WITHOUT_CONFIDENCE)
+    kept = without_kinds(scene.findings, DEPTH_KIND, DISTORTED_MAPS, WITHOUT_CONFIDENCE)
     return scene.replace(depths=maps, findings=(*kept, *map_findings(maps)))
 
 

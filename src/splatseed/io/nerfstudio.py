@@ -53,7 +53,7 @@ from splatseed.io.frame_files import (
 )
 from splatseed.io.origin import recentered
 from splatseed.io.photograph import lens_findings
-from splatseed.io.photograph_checks import photograph_findings
+from splatseed.io.photograph_checks import ASPECT_SLACK, photograph_findings
 from splatseed.io.picture import open_picture
 from splatseed.io.ply import read_ply_float64
 from splatseed.io.point_files import differing_points
@@ -64,6 +64,14 @@ from splatseed.text import counted
 
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_FISHEYE = "OPENCV_FISHEYE"
+_UNDISTORTED = ("PINHOLE", "SIMPLE_PINHOLE")
+_LENS_MODELS = frozenset({"camera_model", "is_fisheye"})
+"""Keys of which either states the lens model."""
+_MAX_PIXELS = 1e9
+"""Above all sizes and focal lengths, in pixels."""
+_FOCAL_LENGTHS = {a: frozenset({f"{a}_fov", f"fl_{a}", f"camera_angle_{a}"}) for a in "xy"}
+"""Keys of which any states a focal length."""
 _CONVENTION = f"each transform_matrix is world_from_cam, {OPENGL}"
 NERFSTUDIO = "dataparser_transforms.json"
 _MATRIX_KEYS = ("transform", "matrix", "transform_matrix", "transformation")
@@ -210,7 +218,7 @@ def read_transforms(path: Path) -> Transforms:
     for frame, image_id in zip(frames, ids, strict=True):
         name = frame.file.relative_to(image_dir).as_posix()
         where = f"{frame.where} ({name})"
-        values = {**meta, **frame.fields}
+        values = _merged(meta, frame.fields)
         try:
             key = _camera(where, values, frame.file)
             if key not in cameras:
@@ -219,7 +227,7 @@ def read_transforms(path: Path) -> Transforms:
         except NotFiniteError as error:
             unusable[name] = error
             continue
-        odd += bool(values.get("k4")) and key[0] != "OPENCV_FISHEYE"
+        odd += bool(values.get("k4")) and key[0] != _FISHEYE
         quat, translation = rigid_pose(where, pose @ OPENCV_FROM_OPENGL)
         image = Image(name, image_id, cameras[key], quat, translation)
         if name in images:
@@ -271,6 +279,47 @@ def _number(where: str, values: Mapping[str, Any], key: str, default: float | No
     return number
 
 
+def _merged(shared: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a frame over those that all frames share.
+
+    As in instant-ngp, focal lengths and lens models of the frame replace those of the file, however
+    either are stated. Shared intrinsics are in pixels of the shared size; a frame of another size
+    has resized ones.
+    """
+    stated = {key: value for key, value in own.items() if value is not None}
+    size, own_size = ([each.get(key) for key in ("w", "h")] for each in (shared, stated))
+    resized = dict[str, Any]()
+    if all(_is_positive(each) for each in (*size, *own_size)):
+        ratio = np.array(own_size, np.float64) / np.array(size, np.float64)
+        resized = {f"c{axis}": ratio[i] for i, axis in enumerate("xy")}
+        if abs(ratio[0] / ratio[1] - 1) <= ASPECT_SLACK:  # else cropped
+            resized |= {f"fl_{axis}": ratio[i] for i, axis in enumerate("xy")}
+    replaced = set[str]()
+    if stated.keys() & _FOCAL_LENGTHS["x"]:
+        replaced |= _FOCAL_LENGTHS["x"] | _FOCAL_LENGTHS["y"]  # square pixels, unless stated too
+    if stated.keys() & _FOCAL_LENGTHS["y"]:
+        replaced |= _FOCAL_LENGTHS["y"]
+    if stated.keys() & _LENS_MODELS:
+        model, other = _lens_model(stated), _lens_model(shared)
+        if model != other and (model in _UNDISTORTED or _FISHEYE in (model, other)):
+            replaced |= {*_LENS_MODELS, *_DISTORTION}
+    kept = {key: value for key, value in shared.items() if key not in replaced}
+    kept |= {key: kept[key] * by for key, by in resized.items() if _is_positive(kept.get(key))}
+    return {**kept, **stated}
+
+
+def _is_positive(value: object) -> bool:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return number and 0 < value < _MAX_PIXELS  # type: ignore[operator]
+
+
+def _lens_model(values: Mapping[str, Any]) -> str:
+    """Return the name of a lens model; instant-ngp has a flag for fisheye lenses."""
+    if values.get("is_fisheye") is True:
+        return _FISHEYE
+    return str(values.get("camera_model", "OPENCV"))
+
+
 def _camera(
     where: str, values: Mapping[str, Any], file: Path
 ) -> tuple[str, int, int, tuple[float, ...]]:
@@ -291,15 +340,15 @@ def _camera(
 def _focal_length(
     where: str, values: Mapping[str, Any], axis: str, size: int, default: float | None
 ) -> float:
-    angle = values.get(f"camera_angle_{axis}")
-    if values.get(f"fl_{axis}") is None and angle is not None:
-        radians = _number(where, values, f"camera_angle_{axis}")
-        if not 0 < radians < math.pi:
-            expected = f"a camera_angle_{axis} between 0 and pi, in radians, in {where}"
-            raise NotFiniteError(expected, found=f"{radians:g}", fix=FIX)
-        focal_length = 0.5 * size / math.tan(radians / 2)
-    else:
-        focal_length = _number(where, values, f"fl_{axis}", default)
+    keys = f"{axis}_fov", f"fl_{axis}", f"camera_angle_{axis}"  # as instant-ngp prefers them
+    key = next((key for key in keys if values.get(key) is not None), f"fl_{axis}")
+    focal_length = _number(where, values, key, default)
+    if key != f"fl_{axis}":
+        turn, unit = (360, "degrees") if key == f"{axis}_fov" else (2 * math.pi, "radians")
+        if not 0 < focal_length < turn / 2:
+            expected = f"a {key} between 0 and {'180' if turn == 360 else 'pi'}, in {unit}, in"
+            raise NotFiniteError(f"{expected} {where}", found=f"{focal_length:g}", fix=FIX)
+        focal_length = 0.5 * size / math.tan(math.pi * focal_length / turn)
     if not 0 < focal_length < math.inf:
         expected = f"a positive focal length fl_{axis} in {where}"
         raise NotFiniteError(expected, found=f"{focal_length:g}", fix=FIX)
@@ -308,10 +357,10 @@ def _focal_length(
 
 def _lens(where: str, values: Mapping[str, Any]) -> tuple[str, tuple[float, ...]]:
     """Return COLMAP's model and distortion; COLMAP has no k4 for perspective lenses."""
-    model = str(values.get("camera_model", "OPENCV"))
+    model = _lens_model(values)
     k1, k2, k3, k4, p1, p2 = (_number(where, values, key, 0.0) for key in _DISTORTION)
-    if model == "OPENCV_FISHEYE" or values.get("is_fisheye") is True:
-        return "OPENCV_FISHEYE", (k1, k2, k3, k4)
+    if model == _FISHEYE:
+        return _FISHEYE, (k1, k2, k3, k4)
     if model not in _PERSPECTIVE:
         raise SceneFormatError(
             f"a perspective or OPENCV_FISHEYE camera_model in {where}",

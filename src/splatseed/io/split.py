@@ -7,6 +7,7 @@ line, as in nerfstudio's COLMAP reader, graphdeco (beside the model) and others.
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
@@ -94,14 +95,19 @@ def _split(scene: Scene, origin: str, parts: list[list[str]]) -> tuple[Split | N
 
 def _known(names: Sequence[str], listed: Sequence[str], prefixes: Sequence[str]) -> dict[str, str]:
     """Match listed names to images: by full or folder-relative name, else by file name or stem."""
-    exact = {f"{prefix}{name}": name for prefix in reversed(prefixes) for name in names}
-    plain = {each: each.replace("\\", "/").removeprefix("./") for each in listed}
+    exact = {_composed(f"{each}{name}"): name for each in reversed(prefixes) for name in names}
+    plain = {each: _composed(each).replace("\\", "/").removeprefix("./") for each in listed}
     known = {each: exact[name] for each, name in plain.items() if name in exact}
     for field in () if known else ("name", "stem"):
-        parts = {getattr(PurePosixPath(name), field): name for name in names}
+        parts = {getattr(PurePosixPath(_composed(name)), field): name for name in names}
         if len(parts) == len(names):  # unless ambiguous
             wanted = {each: getattr(PurePosixPath(name), field) for each, name in plain.items()}
             known = {each: parts[part] for each, part in wanted.items() if part in parts}
         if known:
             break
     return known
+
+
+def _composed(name: str) -> str:
+    """Return a name with one character per umlaut, however it is written."""
+    return unicodedata.normalize("NFC", name)

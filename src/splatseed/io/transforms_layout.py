@@ -197,12 +197,12 @@ def _kept_json(transforms: nerfstudio.Transforms, names: Collection[str]) -> dic
         return path
 
     frames: dict[bool, list[dict[str, Any]]] = {False: [], True: []}
-    used = set()
+    used, shared = set(), _shared_by_all(content, transforms.intrinsics)
     for frame, image in zip(transforms.frames, transforms.images, strict=True):
         if image.name in names:
             fields = frame.fields
             moved = {key: portable(fields[key], found[key]) for key in _PATH_KEYS if key in fields}
-            missing = _missing_fields({**content, **fields}, image.intrinsics)
+            missing = _missing_fields({**shared, **fields}, image.intrinsics)
             frames[frame.is_test].append({**fields, **moved, **missing})
             used.add(os.path.normpath(str(fields["file_path"])))
     all_of = (*content["frames"], *(f.fields for f in transforms.frames if f.is_test))
@@ -213,7 +213,7 @@ def _kept_json(transforms: nerfstudio.Transforms, names: Collection[str]) -> dic
         # Nerfstudio fails over names that no frame has.
         kept_names = [name for name in listed if os.path.normpath(name) not in gone]
         lists[key] = [portable(name, files.photographs([name])) for name in kept_names]
-    kept = {key: value for key, value in content.items() if key != "test_frames"}
+    kept = {key: value for key, value in shared.items() if key != "test_frames"}
     tests = {"test_frames": frames[True]} if frames[True] else {}
     if "camera_model" not in kept:
         kept["camera_model"] = "OPENCV_FISHEYE" if content.get("is_fisheye") is True else "OPENCV"
@@ -231,9 +231,27 @@ def _missing_fields(fields: Mapping[str, Any], camera: Intrinsics) -> dict[str, 
     nerfstudio and OpenSplat need them, and ``camera_model``, where others take ``camera_angle_x``
     and the middle of the photograph.
     """
+    known = _fields_of(camera).items()
+    return {name: value for name, value in known if fields.get(name) is None}
+
+
+def _fields_of(camera: Intrinsics) -> dict[str, float]:
     values = camera.width, camera.height, *camera.pinhole.params
-    known = dict(zip(_FIELDS, values, strict=True))
-    return {name: value for name, value in known.items() if fields.get(name) is None}
+    return dict(zip(_FIELDS, values, strict=True))
+
+
+def _shared_by_all(content: Mapping[str, Any], cameras: Sequence[Intrinsics]) -> dict[str, Any]:
+    """Return a file's content without fields that some of its frames replace.
+
+    nerfstudio takes them for all frames, whatever these state.
+    """
+    known = [_fields_of(camera) for camera in cameras]
+    replaced = {
+        name
+        for name in _FIELDS
+        if any(content.get(name) not in (None, each[name]) for each in known)
+    }
+    return {key: value for key, value in content.items() if key not in replaced}
 
 
 def _moved_json(content: dict[str, Any], offset: Float64[np.ndarray, " 3"]) -> dict[str, Any]:
