@@ -190,7 +190,7 @@ def find_evidence(
                 block, view.camera.pixels_from_world,
                 np.sqrt(abs(view.K[0, 0] * view.K[1, 1])), view.width, view.height, surfaces[v],
                 behind, no_rays if free is None else free[v], view.photograph,
-                no_mask if view.mask is None else view.mask, closeness, samples,
+                no_mask if view.surface is None else view.surface, closeness, samples,
                 evidence.num_views[part], evidence.violations[part], evidence.confirmations[part],
             )  # fmt: skip
             progress("compare with photographs", (b * len(views) + v + 1) / steps)
