@@ -198,6 +198,14 @@ def find_evidence(
     return evidence
 
 
+def colors_of_points(
+    views: Sequence[View], xyz: Float32[np.ndarray, "N 3"], progress: Progress
+) -> UInt8[np.ndarray, "N 3"]:
+    """Return the colours of points in the photographs that see them; mid grey where none does."""
+    surfaces, cell = find_surfaces(views, xyz, progress)
+    return find_evidence(views, xyz, surfaces, cell, None, progress).rgb
+
+
 def surface_agreement(
     views: Sequence[View],
     surfaces: Sequence[SurfaceDepths],
