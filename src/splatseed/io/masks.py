@@ -47,7 +47,7 @@ _SAMPLE = 5
 """Masks that are read with a scene."""
 _MOST = 0.5
 """Share of masked pixels from which on masks may be inverted ones."""
-_MOSTLY_MASKED, _TRANSPARENT = "mostly-masked", "transparent-pixels"  # kinds of findings
+_MOSTLY_MASKED, TRANSPARENT = "mostly-masked", "transparent-pixels"  # kinds of findings
 _CUT_OUT, _CHANGING = 0.2, 0.02
 """Share of transparent pixels, in the median photograph, from which on an object may be cut out,
 and of pixels that are transparent in some photographs only: a lens leaves the same border in
@@ -67,7 +67,7 @@ def with_masks(scene: Scene, choice: str | None) -> Scene:
         return scene
     own, found = scene.masks or Masks({}), list[Finding]()
     if choice in {NONE, ALPHA}:
-        kept = without_kinds(scene.findings, _TRANSPARENT)
+        kept = without_kinds(scene.findings, TRANSPARENT)
         if choice == ALPHA:
             return scene.replace(masks=replace(own, alpha=True, choice=choice), findings=kept)
         return scene.replace(masks=None, findings=without_kinds(kept, _MOSTLY_MASKED))
@@ -143,10 +143,10 @@ def _with_transparency(masks: Masks, paths: Sequence[Path]) -> tuple[Masks, list
     if not masks.alpha or (np.median(shares) >= _CUT_OUT and changing.mean() >= _CHANGING):
         text = f"{share}, are empty space: black in training and in scores."
         fix = f"`masks={ALPHA!r}` leaves them out of both."
-        return replace(masks, alpha=False), [Finding(_TRANSPARENT, text, "info", fix=fix)]
+        return replace(masks, alpha=False), [Finding(TRANSPARENT, text, "info", fix=fix)]
     text = f"{share}, are left out of training and of scores."
     fix = f"`masks={NONE!r}` trains them as empty space, in black."
-    return masks, [Finding(_TRANSPARENT, text, "info", fix=fix)]
+    return masks, [Finding(TRANSPARENT, text, "info", fix=fix)]
 
 
 def masks_near(photographs: Path) -> tuple[Masks, list[Finding]]:

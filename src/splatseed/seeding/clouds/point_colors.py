@@ -64,4 +64,4 @@ def with_colors(scene: Scene, test_every: int, note: Note, progress: Progress) -
 def _rows_without(points: PointCloud) -> Int64[np.ndarray, " M"]:
     """Return the rows of the finite originals that lack a colour."""
     rows = np.flatnonzero((points.source == ORIGINAL) & points.finite)
-    return rows[lacks_color(points.rgb[rows])]
+    return np.asarray(rows[lacks_color(points.rgb[rows])])
