@@ -163,12 +163,9 @@ def masks_near(photographs: Path) -> tuple[Masks, list[Finding]]:
         where = next(iter(files.values())).parent
         text = f"{counted(len(files), 'photograph')} with a mask in {where}."
         found = [Finding("masks-used", text, "info"), *found]
-    found += _mostly_masked(Masks(files), "invert them")
     masks, transparent = _with_transparency(Masks(files), [folder / name for name in names])
-    return masks, [
-        *found,
-        *(replace(each, fix="") for each in transparent),
-    ]  # sfm has no such option
+    found += [replace(each, fix="") for each in transparent]  # sfm has no such option
+    return masks, [*found, *_mostly_masked(masks, "invert them")]
 
 
 def _mostly_masked(masks: Masks, fix: str = f"use `masks={INVERTED!r}`") -> list[Finding]:
