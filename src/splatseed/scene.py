@@ -143,13 +143,16 @@ class Image:
     def read(self) -> UInt8[np.ndarray, "H W 3"]:
         """Read the photograph, sRGB, as stored: not rotated by EXIF, resized or undistorted.
 
+        Transparent pixels are composited over black; where masks leave them out, those below half
+        of the full alpha are black and the others opaque.
+
         Raises:
             SceneNotFoundError: There is no such file.
             SceneFormatError: It is no image, or damaged.
         """
         from splatseed.io.photograph import read_photograph
 
-        return read_photograph(self.path, self.white)
+        return read_photograph(self.path, self.white, composited=self.shows_empty_space)
 
     def read_mask(self, factor: int = 1) -> Bool[np.ndarray, "h w"] | None:
         """Read which pixels of the photograph count; None if all do.
@@ -164,6 +167,25 @@ class Image:
         from splatseed.io.masks import read_mask
 
         return read_mask(self.masks, self.name, self.path, factor)
+
+    def read_empty(self, factor: int = 1) -> Bool[np.ndarray, "h w"] | None:
+        """Read which pixels show empty space, by their transparency; None if none do.
+
+        Args:
+            factor: Integer reduction; a reduced pixel is empty if any of its ``factor``^2 block is.
+
+        Raises:
+            SceneNotFoundError: There is no such file.
+            SceneFormatError: It is no image, or damaged.
+        """
+        from splatseed.io.masks import read_empty
+
+        return read_empty(self.path, factor) if self.shows_empty_space else None
+
+    @property
+    def shows_empty_space(self) -> bool:
+        """Whether transparent pixels, if there are any, count: as black, empty space."""
+        return self.masks is None or not self.masks.alpha
 
     @cached_property
     def camera(self) -> Camera:
@@ -274,7 +296,7 @@ class Masks:
 
     files: Mapping[str, Path]  # by the image's name; an image without one is used whole
     inverted: bool = False  # whether pixels where the file is not 0 are masked instead
-    alpha: bool = True  # whether pixels of a photograph that are not opaque are masked, too
+    alpha: bool = True  # whether transparent pixels are masked, too; else they are empty space
     choice: str | None = None  # what the user asked for, to be asked for again; None: the default
 
 

@@ -64,15 +64,80 @@ def test_a_smaller_pixel_counts_only_if_all_of_its_pixels_count(scene_path):
 
 
 def test_transparent_pixels_do_not_count(scene_path):
+    """From half of the full alpha on they show something, in their own colour."""
     path = scene_path / "images/view_000.png"
     with PilImage.open(path) as photograph:
-        photograph.putalpha(PilImage.fromarray(np.full((72, 96), 255, np.uint8)))
+        photograph.putalpha(PilImage.fromarray(np.full((72, 96), 250, np.uint8)))
         photograph.save(path)
         assert masks_of(load_scene(scene_path))[0] is None
-        photograph.putpixel((5, 7), (1, 2, 3, 254))
+        photograph.putpixel((5, 7), (1, 2, 3, 127))
+        photograph.putpixel((6, 7), (1, 2, 3, 128))
         photograph.save(path)
-    mask = masks_of(load_scene(scene_path))[0]
-    assert np.argwhere(~mask).tolist() == [[7, 5]]
+    scene = load_scene(scene_path)
+    (view,) = load_views(scene, scene.images[:1])
+    assert np.argwhere(~view.mask).tolist() == [[7, 5]]
+    assert view.photograph[7, 5:7].tolist() == [[0, 0, 0], [1, 2, 3]]
+    assert np.array_equal(view.photograph, scene.images[0].read())
+    (found,) = (each for each in scene.findings if each.kind == "transparent-pixels")
+    assert "left out" in found.text
+
+
+def cut_out(path, *, moving):
+    """Make the photographs opaque in a box, which moves with each, with a soft edge."""
+    for i, file in enumerate(sorted((path / "images").iterdir())):
+        alpha = np.zeros((72, 96), np.uint8)
+        first = 10 + 4 * i * moving
+        alpha[10:60, first : first + 40] = 250
+        alpha[9, first : first + 40] = 60
+        with PilImage.open(file) as photograph:
+            photograph.putalpha(PilImage.fromarray(alpha))
+            photograph.save(file)
+
+
+def test_transparent_pixels_around_an_object_that_is_cut_out_are_empty(scene_path, tmp_path):
+    cut_out(scene_path, moving=True)
+    scene = load_scene(scene_path)
+    (found,) = (each for each in scene.findings if each.kind == "transparent-pixels")
+    assert "empty space" in found.text
+    (view,) = load_views(scene, scene.images[:1])
+    straight = np.asarray(PilImage.open(scene.images[0].path))
+    opaque = straight[..., 3] >= 128
+    assert view.mask is None
+    assert np.array_equal(view.surface, opaque)
+    composited = straight[..., :3] * (straight[..., 3:] / 255.0)
+    assert np.abs(view.photograph - composited).max() <= 1
+    small = load_views(scene, scene.images[:1], data_factor=4)[0]
+    assert np.array_equal(small.surface, opaque.reshape(18, 4, 24, 4).all(axis=(1, 3)))
+
+    left_out, shown = with_masks(scene, "alpha"), with_masks(scene, "none")
+    (masked,), (same,) = (load_views(each, each.images[:1]) for each in (left_out, shown))
+    assert np.array_equal(masked.mask, opaque)
+    assert np.array_equal(same.surface, view.surface)
+    for i, each in enumerate((scene, left_out, shown)):
+        again = load_scene(write_scene(each, tmp_path / f"out{i}").path)
+        assert mask_choice(again) == (None, "alpha", "none")[i]
+        assert again.images[0].shows_empty_space == (i != 1)
+
+
+def test_the_same_transparent_border_in_all_photographs_is_masked(scene_path):
+    cut_out(scene_path, moving=False)
+    scene = load_scene(scene_path)
+    (view,) = load_views(scene, scene.images[:1])
+    assert view.empty is None
+    assert view.mask.mean() == pytest.approx(50 * 40 / (72 * 96))
+
+
+def test_cover_makes_no_seed_in_empty_pixels(scene_path):
+    cut_out(scene_path, moving=True)
+    scene = load_scene(scene_path)
+    one = scene.replace(images=scene.images[:1])
+    opaque = load_views(one, one.images)[0].surface
+    seeds = upsample(one, "cover")
+    uv = one.images[0].camera.project(seeds.xyz[seeds.num_original :])[0].astype(int)
+    # A cell of 8 px needs half of its pixels.
+    near = np.pad(opaque, 4).astype(int)
+    assert len(uv)
+    assert all(near[v : v + 9, u : u + 9].any() for u, v in uv)
 
 
 def test_a_folder_none_and_inverted_can_be_chosen(scene_path, tmp_path):

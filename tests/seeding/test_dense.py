@@ -105,7 +105,9 @@ def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads(made, few, 
 def test_held_out_photographs_are_not_compared_again(few, monkeypatch):
     read, load = [], loading.load_photograph
     monkeypatch.setattr(
-        loading, "load_photograph", lambda path, *a: (read.append(path.name), load(path, *a))[1]
+        loading,
+        "load_photograph",
+        lambda path, *a, **k: (read.append(path.name), load(path, *a, **k))[1],
     )
     seeds = ss.upsample(few, budget=BUDGET, test_every=3)
     assert 0.9 * BUDGET < len(seeds) <= BUDGET

@@ -66,7 +66,9 @@ def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads(
 def test_held_out_photographs_are_never_read(method, room, monkeypatch):
     read, load = [], loading.load_photograph
     monkeypatch.setattr(
-        loading, "load_photograph", lambda path, *a: (read.append(path.name), load(path, *a))[1]
+        loading,
+        "load_photograph",
+        lambda path, *a, **k: (read.append(path.name), load(path, *a, **k))[1],
     )
     ss.upsample(room, method, test_every=4, cover=12)
     names = sorted(image.name for image in room.images)

@@ -10,6 +10,7 @@ import pytest
 import torch
 from PIL import Image as PilImage
 
+from splatseed import train
 from splatseed.errors import ParameterError
 from splatseed.io import load_scene
 from splatseed.io.masks import with_masks
@@ -133,3 +134,21 @@ def test_masks_that_changed_since_a_run_began_are_found_out(larger_room_path, tm
             == noted
         )
         mask.unlink(missing_ok=True)
+
+
+def test_nothing_is_around_an_object_that_is_cut_out(larger_room_path, tmp_path):
+    """Renders are black where photographs are transparent, unless these pixels are left out."""
+    path = shutil.copytree(larger_room_path, tmp_path / "cut")
+    for i, file in enumerate(sorted((path / "images").iterdir())):
+        alpha = np.zeros((72, 96), np.uint8)
+        alpha[12:60, 16 + i : 64 + i] = 250
+        with PilImage.open(file) as photograph:
+            photograph.putalpha(PilImage.fromarray(alpha))
+            photograph.save(file)
+    scene = load_scene(path)
+    outside = {}
+    for masks in (None, "alpha"):
+        run = train(scene, tmp_path / f"{masks}", max_steps=60, strategy="none", masks=masks)
+        (view, *_) = load_views(scene, scene.images[:1])
+        outside[masks] = run.render(view.camera)[view.empty].mean()
+    assert outside[None] < 0.5 * outside["alpha"]

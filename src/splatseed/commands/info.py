@@ -42,6 +42,7 @@ from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.seeding import diagnostics
 from splatseed.seeding.advice import Advice, advice_for, is_distorted, untrainable
+from splatseed.seeding.clouds.point_colors import missing_color_findings
 from splatseed.seeding.photo_methods import has_points, photographed
 from splatseed.text import counted, quoted, visible
 from splatseed.training.folder import RunFolder
@@ -102,6 +103,7 @@ def run(arguments: list[str]) -> None:
         # An empty part is reason to upsample, which was done.
         empty = None if was_upsampled(scene) else regions
         problems = [*diagnostics.find_problems(scene, cloud, empty)]
+        problems += missing_color_findings(scene)
         alignments = None if options.depth is None else _alignments(options, scene, clock)
         known = _known_depths(scene.depths, clock) if options.depth and scene.depths else 0
         maps = diagnostics.depth_map_statistics(scene, clock)

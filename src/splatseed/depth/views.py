@@ -33,6 +33,7 @@ from splatseed.depth.settings import DepthSettings
 from splatseed.depthmap import DepthMap, DepthMaps, in_scene_units
 from splatseed.io.photograph_checks import check_sizes
 from splatseed.photos.loading import refuse_distortion
+from splatseed.photos.view import surface_pixels
 from splatseed.photos.visibility import Visibility, points_in_image
 from splatseed.scene import Image
 
@@ -97,8 +98,9 @@ def read_view(
     """Read an image and its map, and draw about ``num`` candidates."""
     refuse_distortion(image, reason="along whose rays pixels are lifted")
     depth = depths.read(image.name).reliable(settings.min_confidence)
-    if (mask := image.read_mask()) is not None:
-        values = np.where(pixels_within(mask, depth), depth.values, np.float32(np.nan))
+    surface = surface_pixels(image.read_mask(), image.read_empty())
+    if surface is not None:
+        values = np.where(pixels_within(surface, depth), depth.values, np.float32(np.nan))
         depth = replace(depth, values=values)
     camera = map_camera(depth, image)
     points = points_in_image(camera, visibility.of(image))

@@ -1,14 +1,19 @@
 """Read and write masks of photographs.
 
-A mask is an image of its photograph's aspect ratio; 0 means masked, as in COLMAP and nerfstudio.
-Pixels that are not opaque are masked, too. In code, True marks valid pixels. Promise: a pixel of a
-reduced or undistorted copy is valid only if all of its source pixels are. ``mask_files`` finds
-the files.
+A mask is an image of its photograph's aspect ratio; 0 means masked, as in COLMAP and nerfstudio. In
+code, True marks valid pixels. Promise: a pixel of a reduced or undistorted copy is valid only if
+all of its source pixels are. ``mask_files`` finds the files.
+
+*Transparent* pixels, of an alpha below ``photograph.OPAQUE``, are either masked, or *empty*: they
+count as black, the background of renders, so that training learns that nothing is there. They are
+empty in photographs of an object that is cut out, where a large area is transparent, another one in
+each photograph. Small holes, and borders that undistortion or a lens leaves, are masked. In either
+case they get no seeds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -24,16 +29,17 @@ from splatseed.findings import Finding, without_kinds
 from splatseed.io.depth_maps import Undistortion
 from splatseed.io.files import files_below, read_bytes, translate_errors
 from splatseed.io.mask_files import SUFFIXES, find_masks, find_own_masks, masks_among
-from splatseed.io.photograph import has_alpha, open_photograph, photograph_bytes
+from splatseed.io.photograph import has_alpha, open_photograph, photograph_bytes, read_transparent
 from splatseed.io.photograph_checks import photograph_size
-from splatseed.io.picture import is_16_bit, opaque_value, read_16_bit
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.sampling import strided
 from splatseed.scene import Masks, Scene
 from splatseed.text import counted
 
-NONE, INVERTED = "none", "inverted"
-"""Values of ``masks`` besides a folder; ``inverted:DIR`` inverts the masks of a folder."""
+NONE, INVERTED, ALPHA = "none", "inverted", "alpha"
+"""Values of ``masks`` besides a folder; ``inverted:DIR`` inverts the masks of a folder.
+
+With ``none`` transparent pixels are empty, with ``alpha`` they are masked."""
 _LISTED = "masks of the scene's images, named a.jpg.png or a.png for a.jpg,"
 _LOSSY = ("JPEG", "MPO", "WEBP")
 """Formats that may store 0 as slightly more."""
@@ -41,11 +47,18 @@ _SAMPLE = 5
 """Masks that are read with a scene."""
 _MOST = 0.5
 """Share of masked pixels from which on masks may be inverted ones."""
-_MOSTLY_MASKED = "mostly-masked"  # the kind of finding
+_MOSTLY_MASKED, TRANSPARENT = "mostly-masked", "transparent-pixels"  # kinds of findings
+_CUT_OUT, _CHANGING = 0.2, 0.02
+"""Share of transparent pixels, in the median photograph, from which on an object may be cut out,
+and of pixels that are transparent in some photographs only: a lens leaves the same border in
+all."""
 
 
 def with_masks(scene: Scene, choice: str | None) -> Scene:
     """Attach masks: those of a folder, inverted ones, or none; ``choice=None`` changes nothing.
+
+    With ``none`` transparent pixels are empty, with ``alpha`` masked, beside the masks that are
+    there.
 
     Raises:
         SceneNotFoundError: No image has a mask there.
@@ -53,9 +66,12 @@ def with_masks(scene: Scene, choice: str | None) -> Scene:
     if choice is None:
         return scene
     own, found = scene.masks or Masks({}), list[Finding]()
+    if choice in {NONE, ALPHA}:
+        kept = without_kinds(scene.findings, TRANSPARENT)
+        if choice == ALPHA:
+            return scene.replace(masks=replace(own, alpha=True, choice=choice), findings=kept)
+        return scene.replace(masks=None, findings=without_kinds(kept, _MOSTLY_MASKED))
     kept = without_kinds(scene.findings, _MOSTLY_MASKED)
-    if choice == NONE:
-        return scene.replace(masks=None, findings=kept)
     inverted = choice == INVERTED or choice.startswith(f"{INVERTED}:")
     location = choice.removeprefix(INVERTED).removeprefix(":") if inverted else choice
     files: Mapping[str, Path] = own.files
@@ -101,7 +117,36 @@ def with_own_masks(scene: Scene) -> Scene:
         files, found = find_own_masks(names, folder, root)
         found += _resized(files, folder)
         masks = replace(masks, files=files)
+    if masks.choice is None:
+        paths = [image.path for image in scene.images if image.has_photograph]
+        masks, transparent = _with_transparency(masks, paths)
+        found += transparent
     return scene.replace(masks=masks, findings=(*scene.findings, *found, *_mostly_masked(masks)))
+
+
+def _with_transparency(masks: Masks, paths: Sequence[Path]) -> tuple[Masks, list[Finding]]:
+    """Decide by a sample of photographs whether transparent pixels are empty, and report it.
+
+    Those of a scene whose reader knows that they are, such as a Blender pair, stay empty.
+    """
+    sample, pixels = strided(paths, _SAMPLE), list[Bool[np.ndarray, "H W"]]()
+    for path in sample:
+        with suppress(SplatseedError):  # reported when used
+            if (each := read_transparent(path)) is not None and each.any():
+                pixels.append(each)
+    if not pixels:
+        return masks, []
+    shares = [*(float(each.mean()) for each in pixels), *[0.0] * (len(sample) - len(pixels))]
+    share = f"Transparent pixels, {np.mean(shares):.0%} of the photographs"
+    alike = {each.shape for each in pixels} == {pixels[0].shape}
+    changing = np.any(pixels, axis=0) & ~np.all(pixels, axis=0) if alike else np.ones(1, np.bool_)
+    if not masks.alpha or (np.median(shares) >= _CUT_OUT and changing.mean() >= _CHANGING):
+        text = f"{share}, are empty space: black in training and in scores."
+        fix = f"`masks={ALPHA!r}` leaves them out of both."
+        return replace(masks, alpha=False), [Finding(TRANSPARENT, text, "info", fix=fix)]
+    text = f"{share}, are left out of training and of scores."
+    fix = f"`masks={NONE!r}` trains them as empty space, in black."
+    return masks, [Finding(TRANSPARENT, text, "info", fix=fix)]
 
 
 def masks_near(photographs: Path) -> tuple[Masks, list[Finding]]:
@@ -118,7 +163,9 @@ def masks_near(photographs: Path) -> tuple[Masks, list[Finding]]:
         where = next(iter(files.values())).parent
         text = f"{counted(len(files), 'photograph')} with a mask in {where}."
         found = [Finding("masks-used", text, "info"), *found]
-    return Masks(files), [*found, *_mostly_masked(Masks(files), "invert them")]
+    masks, transparent = _with_transparency(Masks(files), [folder / name for name in names])
+    found += [replace(each, fix="") for each in transparent]  # sfm has no such option
+    return masks, [*found, *_mostly_masked(masks, "invert them")]
 
 
 def _mostly_masked(masks: Masks, fix: str = f"use `masks={INVERTED!r}`") -> list[Finding]:
@@ -157,6 +204,8 @@ def read_mask(
 
     A pixel reduced by an integer ``factor`` is valid if all ``factor``^2 are.
 
+    Transparent pixels are not valid where ``Masks.alpha`` says so.
+
     Raises:
         SceneNotFoundError: The mask's file is missing.
         SceneFormatError: It is no image, has another aspect ratio, or masks every pixel.
@@ -174,14 +223,11 @@ def read_mask(
                 fix="Make it from that photograph, without cropping or rotating it.",
             )
         parts.append(_fitted(marked, size))
-    if masks.alpha and (opaque := _opaque(photograph)) is not None:
-        parts.append(opaque)
+    if masks.alpha and (transparent := read_transparent(photograph)) is not None:
+        parts.append(~transparent)
     if not parts:
         return None
-    counts = np.logical_and.reduce(parts)
-    rows, columns = counts.shape[0] // factor, counts.shape[1] // factor
-    blocks = counts[: rows * factor, : columns * factor].reshape(rows, factor, columns, factor)
-    counts = blocks.all(axis=(1, 3))
+    counts = _reduced(np.logical_and.reduce(parts), factor)
     if counts.size and not counts.any():
         reduced = "" if factor == 1 else f", reduced by a factor of {factor}"
         raise SceneFormatError(
@@ -191,6 +237,23 @@ def read_mask(
             f"pixels, pass `masks={INVERTED!r}`.",
         )
     return None if counts.all() else np.asarray(counts)
+
+
+def read_empty(photograph: Path, factor: int = 1) -> Bool[np.ndarray, "h w"] | None:
+    """Read the transparent pixels of a photograph; None without any.
+
+    A reduced pixel is transparent if any pixel of its ``factor``^2 block is.
+    """
+    transparent = read_transparent(photograph)
+    if transparent is None or not transparent.any():
+        return None
+    return ~_reduced(~transparent, factor)
+
+
+def _reduced(counts: Bool[np.ndarray, "H W"], factor: int) -> Bool[np.ndarray, "h w"]:
+    rows, columns = counts.shape[0] // factor, counts.shape[1] // factor
+    blocks = counts[: rows * factor, : columns * factor].reshape(rows, factor, columns, factor)
+    return np.asarray(blocks.all(axis=(1, 3)))
 
 
 def _read_counts(path: Path) -> Bool[np.ndarray, "H W"]:
@@ -216,21 +279,6 @@ def _fitted(counts: Bool[np.ndarray, "H W"], size: tuple[int, int]) -> Bool[np.n
             masked = np.cumsum(np.insert(~counts, 0, False, axis=axis), axis=axis)
             counts = masked.take(start, axis=axis) == masked.take(stop, axis=axis)
     return counts
-
-
-def _opaque(photograph: Path) -> Bool[np.ndarray, "H W"] | None:
-    """Return the fully opaque pixels; None for files without transparency."""
-    if photograph.suffix.lower() in {".jpg", ".jpeg"}:  # never transparent: skip reading
-        return None
-    encoded = photograph_bytes(photograph)
-    picture = open_photograph(photograph, encoded)
-    if not has_alpha(picture) or picture.mode.startswith(("I", "F")):
-        return None
-    with translate_errors(photograph, "an image, neither cut short nor damaged"):
-        if is_16_bit(picture):
-            alpha = read_16_bit(encoded)[..., -1]
-            return np.asarray(alpha == opaque_value(alpha))
-        return np.asarray(np.asarray(picture.convert("RGBA").getchannel("A")) == 255)
 
 
 def write_masks(
@@ -263,6 +311,23 @@ def write_masks(
 def _write(path: Path, counts: Bool[np.ndarray, "H W"]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     PilImage.fromarray(np.where(counts, 255, 0).astype(np.uint8)).save(path)
+
+
+def write_transparency(
+    image_dir: Path, copies: Path, lenses: Mapping[str, tuple[Intrinsics, Intrinsics]]
+) -> None:
+    """Make empty pixels transparent in undistorted copies of photographs, which lost their alpha.
+
+    ``lenses`` as in ``write_masks``.
+    """
+    for name, (lens, pinhole) in lenses.items():
+        copy, transparent = copies / name, read_transparent(image_dir / name)
+        if transparent is None or lens == pinhole:  # the copy is that of the file
+            continue
+        shown = _undistorted(~transparent, lens, pinhole)
+        picture = open_photograph(copy, photograph_bytes(copy)).convert("RGB")
+        picture.putalpha(PilImage.fromarray(np.where(shown, 255, 0).astype(np.uint8)))
+        picture.save(copy, lossless=True)  # of WebP; PNG and TIFF are
 
 
 def _undistorted(

@@ -1,7 +1,8 @@
 """Read photographs: bytes, size and pixels.
 
 Promise: pixels are as stored, without EXIF rotation, as in COLMAP; transparent pixels are
-composited over black, the background of renders; 16 bits per channel and floats in [0, 1] are
+composited over black, the background of renders, or, where they are masked, black up to half of
+the full alpha and of their own colour from there on; 16 bits per channel and floats in [0, 1] are
 rounded to 8 bits, with the capture's *white* (``io.picture``) as 255.
 """
 
@@ -12,7 +13,7 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8, UInt16
+from jaxtyping import Bool, UInt8, UInt16
 from PIL import Image as PilImage
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
@@ -26,8 +27,12 @@ _CHECK_SCALE = 8
 """JPEGs are checked at 1/8 of their size: all bytes are read, few pixels are computed."""
 _WIDE_GREY = ("I", "F")
 """Pillow's modes for one channel of more than 8 bits, which Pillow's conversion clips at 255."""
+_WITH_ALPHA = (2, 4)
+"""Numbers of channels of which the last is alpha."""
 _INKS = ("CMYK", "LAB")
 """Pillow's modes other than RGB and grey; Pillow ignores colour profiles when converting."""
+OPAQUE = 128
+"""Alpha of 255 from which on a pixel shows something, rather than nothing."""
 COPY_AGAIN = "Copy or export the image again."
 _COMPLETE_IMAGE = "an image, neither truncated nor damaged"
 
@@ -77,8 +82,12 @@ def open_photograph(path: Path, encoded: bytes) -> PilImage.Image:
         return open_picture(BytesIO(encoded))
 
 
-def decode_photograph(path: Path, encoded: bytes, white: int = WHITE) -> PilImage.Image:
+def decode_photograph(
+    path: Path, encoded: bytes, white: int = WHITE, *, composited: bool = True
+) -> PilImage.Image:
     """Decode a photograph to RGB; in 16 bits, ``white`` becomes 255.
+
+    Transparent pixels are ``composited`` over black, or black below ``OPAQUE`` and else opaque.
 
     Raises:
         SceneFormatError: No image, truncated or damaged, CMYK or LAB, or of unknown value range.
@@ -94,22 +103,45 @@ def decode_photograph(path: Path, encoded: bytes, white: int = WHITE) -> PilImag
         return _grey_of(path, photograph, white).convert("RGB")
     with translate_errors(path, _COMPLETE_IMAGE, fix=COPY_AGAIN):
         if is_16_bit(photograph):
-            return _colors_of(read_16_bit(encoded), photograph, white)
+            return _colors_of(read_16_bit(encoded), photograph, white, composited=composited)
         if has_alpha(photograph):
             black = PilImage.new("RGBA", photograph.size, (0, 0, 0, 255))
-            return PilImage.alpha_composite(black, photograph.convert("RGBA")).convert("RGB")
+            shown = photograph.convert("RGBA")
+            if not composited:
+                shown.putalpha(shown.getchannel("A").point(lambda alpha: 255 * (alpha >= OPAQUE)))
+            return PilImage.alpha_composite(black, shown).convert("RGB")
         if photograph.mode == "RGB":  # converting would copy it, which takes as long as decoding
             photograph.load()
             return photograph
         return photograph.convert("RGB")
 
 
-def read_photograph(path: Path, white: int = WHITE) -> UInt8[np.ndarray, "H W 3"]:
+def read_photograph(
+    path: Path, white: int = WHITE, *, composited: bool = True
+) -> UInt8[np.ndarray, "H W 3"]:
     """The pixels of a file, at its size; errors as ``photograph_bytes`` and ``decode_photograph``.
 
-    ``white`` is the value that becomes 255 in a file of 16 bits a channel.
+    ``white`` is the value that becomes 255 in a file of 16 bits a channel; ``composited`` as there.
     """
-    return np.array(decode_photograph(path, photograph_bytes(path), white))
+    return np.array(decode_photograph(path, photograph_bytes(path), white, composited=composited))
+
+
+def read_transparent(path: Path) -> Bool[np.ndarray, "H W"] | None:
+    """Read which pixels have an alpha below ``OPAQUE``; None if none can have."""
+    if path.suffix.lower() in {".jpg", ".jpeg"}:  # never transparent: skip reading
+        return None
+    encoded = photograph_bytes(path)
+    photograph = open_photograph(path, encoded)
+    if not has_alpha(photograph) or photograph.mode.startswith(_WIDE_GREY):
+        return None
+    with translate_errors(path, _COMPLETE_IMAGE):
+        if is_16_bit(photograph):
+            values = read_16_bit(encoded)
+            if values.shape[-1] not in _WITH_ALPHA:  # transparent by one colour
+                return np.asarray(np.all(values == photograph.info["transparency"], axis=-1))
+            alpha = values[..., -1]
+            return np.asarray(alpha < opaque_value(alpha) * np.float32(OPAQUE / 255))
+        return np.asarray(np.asarray(photograph.convert("RGBA").getchannel("A")) < OPAQUE)
 
 
 def has_alpha(photograph: PilImage.Image) -> bool:
@@ -128,14 +160,17 @@ def check_photograph(path: Path) -> tuple[int, int]:
 
 
 def _colors_of(
-    values: UInt16[np.ndarray, "H W C"], photograph: PilImage.Image, white: int
+    values: UInt16[np.ndarray, "H W C"], photograph: PilImage.Image, white: int, *, composited: bool
 ) -> PilImage.Image:
     """Convert 16-bit colours or grey to RGB over black."""
     channels = values.shape[-1]
-    colors = values[..., : channels - (channels in {2, 4})]
+    colors = values[..., : channels - (channels in _WITH_ALPHA)]
     shown = np.minimum(colors.astype(np.float32) * np.float32(255 / white), 255)
-    if channels in {2, 4}:
-        shown *= (values[..., -1] / np.float32(opaque_value(values[..., -1])))[..., None]
+    if channels in _WITH_ALPHA:
+        opacity = values[..., -1] / np.float32(opaque_value(values[..., -1]))
+        if not composited:
+            opacity = (opacity >= OPAQUE / 255).astype(np.float32)
+        shown *= opacity[..., None]
     transparent = photograph.info.get("transparency")
     if isinstance(transparent, tuple):
         shown[(colors == transparent).all(axis=-1)] = 0

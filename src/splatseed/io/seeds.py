@@ -24,7 +24,7 @@ from jaxtyping import Float32
 from splatseed.errors import PointCloudError
 from splatseed.findings import Finding
 from splatseed.io.files import ARCHIVE_FAILURES, read_npy
-from splatseed.io.masks import with_own_masks
+from splatseed.io.masks import ALPHA, with_own_masks
 from splatseed.io.staging import MANIFEST, read_manifest, write_json
 from splatseed.pointcloud import ATTRIBUTES, ORIGINAL, PointCloud
 from splatseed.runtime.fingerprint import fingerprint
@@ -47,8 +47,8 @@ _DIGEST_BYTES = 16
 _IGNORED = "seeds-file-ignored"  # the kind of finding
 _ABSENT = "absent"
 """The manifest's key for ``Scene.absent``."""
-_TRANSPARENT, _BLACK = "transparent", "black"
-"""The manifest's entry for masks without ``Masks.alpha``."""
+_TRANSPARENT, _BLACK, _LEFT_OUT = "transparent", "black", "masked"
+"""The manifest's entries for masks without ``Masks.alpha``, and with it by the user's choice."""
 _MASKED, _NOTHING = "masks", "none"
 """The manifest's entry for a scene without masks, whatever lies near its photographs."""
 
@@ -172,8 +172,10 @@ def facts_for_reading(scene: Scene) -> dict[str, Any]:
         facts[_ABSENT] = list(scene.absent)
     if scene.masks is None and scene.source.image_dir:
         facts[_MASKED] = _NOTHING  # else masks near the photographs would count again
-    if scene.masks and not scene.masks.alpha:  # else transparent pixels would be masked
+    if scene.masks and not scene.masks.alpha:  # else transparent pixels might be masked
         facts[_TRANSPARENT] = _BLACK
+    if scene.masks and scene.masks.choice == ALPHA:  # else they might be empty
+        facts[_TRANSPARENT] = _LEFT_OUT
     return facts
 
 
@@ -191,6 +193,9 @@ def with_recorded_masks(scene: Scene) -> Scene:
     manifest = read_manifest(scene.source.root)
     if manifest.get(_MASKED) == _NOTHING:
         return scene.replace(masks=None)
-    if manifest.get(_TRANSPARENT) == _BLACK:  # of a Blender pair
-        scene = scene.replace(masks=replace(scene.masks or Masks({}), alpha=False))
+    masks = scene.masks or Masks({})
+    if manifest.get(_TRANSPARENT) == _BLACK:
+        scene = scene.replace(masks=replace(masks, alpha=False))
+    elif manifest.get(_TRANSPARENT) == _LEFT_OUT:
+        scene = scene.replace(masks=replace(masks, alpha=True, choice=ALPHA))
     return with_own_masks(scene)

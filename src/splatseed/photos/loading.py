@@ -15,7 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 from platformdirs import user_cache_path
 
 from splatseed.camera import Camera
@@ -33,7 +33,7 @@ from splatseed.projection import scaled
 from splatseed.runtime.memory import check_memory
 from splatseed.scene import Image, Scene
 
-FILTER = "box-3"  # part of the cache's key: change it whenever downsampling changes
+FILTER = "box-4"  # part of the cache's key: change it whenever downsampling changes
 READERS = 4  # threads that decode photographs
 
 
@@ -134,31 +134,44 @@ def refuse_distortion(
 
 
 def _load_view(image: Image, data_factor: int, min_side: int, cache_dir: Path | None) -> View:
-    photograph = load_photograph(image.path, data_factor, cache_dir, image.white)
+    photograph = load_photograph(
+        image.path, data_factor, cache_dir, image.white, composited=image.shows_empty_space
+    )
     height, width = photograph.shape[:2]
     check_side(image.path, min_side, data_factor, (width, height))
     lens = image.lens
     K = scaled(lens.K, 1 / data_factor)
     camera = Camera(K, width, height, image.camera.cam_from_world)
-    mask = image.read_mask(data_factor)
+    mask, empty = image.read_mask(data_factor), image.read_empty(data_factor)
     if not lens.has_distortion:
-        return View(image.name, photograph, camera, mask)
+        return View(image.name, photograph, camera, mask, empty)
     from splatseed.photos.undistortion import undistort  # noqa: PLC0415  (loads Numba)
 
     photograph, known = undistort(photograph, lens, K)
     if mask is not None:
-        counted = np.repeat(np.where(mask, 255, 0).astype(np.uint8)[..., None], 3, axis=2)
-        known &= undistort(counted, lens, K)[0][..., 0] == 255
-    return View(image.name, photograph, camera, known)
+        known &= undistort(_painted(mask), lens, K)[0][..., 0] == 255
+    if empty is not None:
+        empty = known & (undistort(_painted(empty), lens, K)[0][..., 0] > 0)
+    return View(image.name, photograph, camera, known, empty)
+
+
+def _painted(pixels: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
+    return np.repeat(np.where(pixels, 255, 0).astype(np.uint8)[..., None], 3, axis=2)
 
 
 def load_photograph(
-    path: StrPath, factor: int = 1, cache_dir: Path | None = None, white: int = WHITE
+    path: StrPath,
+    factor: int = 1,
+    cache_dir: Path | None = None,
+    white: int = WHITE,
+    *,
+    composited: bool = True,
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Read a photograph, downsampled by ``factor``.
 
-    Transparent pixels are laid over black, the background of renders. Smaller copies are cached in
-    ``cache_dir``, if there is one.
+    Transparent pixels are ``composited`` over black, the background of renders, as
+    ``io.photograph.decode_photograph`` has it. Smaller copies are cached in ``cache_dir``, if there
+    is one.
     """
     path = Path(path)
     if factor < 1:
@@ -167,12 +180,11 @@ def load_photograph(
         )
     encoded = photograph_bytes(path)
     digest = hashlib.blake2b(encoded, digest_size=16, person=FILTER.encode()).hexdigest()
-    kept = (
-        None if cache_dir is None or factor == 1 else cache_dir / f"{digest}_{factor}_{white}.npz"
-    )
+    file_name = f"{digest}_{factor}_{white}{'_composited' * composited}.npz"
+    kept = None if cache_dir is None or factor == 1 else cache_dir / file_name
     if kept is not None and (known := _read(kept)) is not None:
         return known
-    original = decode_photograph(path, encoded, white)
+    original = decode_photograph(path, encoded, white, composited=composited)
     width, height = original.width // factor, original.height // factor
     check_side(path, 1, factor, (width, height))
     photograph = original

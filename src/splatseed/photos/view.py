@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, UInt8
@@ -32,6 +33,7 @@ class View:
     photograph: UInt8[np.ndarray, "H W 3"]  # sRGB; ``NO_PIXELS`` if it is not loaded
     camera: Camera  # in pixels of the photograph
     mask: Bool[np.ndarray, "H W"] | None = None  # pixels that count; None: all
+    empty: Bool[np.ndarray, "H W"] | None = None  # pixels that show nothing, in black; None: none
     near: float = NEAR_PLANE  # Gaussians nearer than this are not rendered; in the pose's unit
 
     @property
@@ -54,10 +56,24 @@ class View:
         """The camera's pose."""
         return self.camera.cam_from_world
 
+    @cached_property
+    def surface(self) -> Bool[np.ndarray, "H W"] | None:
+        """Pixels that count and show something; None: all."""
+        return surface_pixels(self.mask, self.empty)
+
     def posed(self, cam_from_world: Float[np.ndarray, "4 4"]) -> View:
         """The same photograph, its camera at another pose."""
         camera = dataclasses.replace(self.camera, cam_from_world=cam_from_world)
         return dataclasses.replace(self, camera=camera)
+
+
+def surface_pixels(
+    mask: Bool[np.ndarray, "H W"] | None, empty: Bool[np.ndarray, "H W"] | None
+) -> Bool[np.ndarray, "H W"] | None:
+    """Return the pixels that count and are not empty; None: all."""
+    if empty is None:
+        return mask
+    return ~empty if mask is None else mask & ~empty
 
 
 def view_of(camera: Image | Camera | View) -> View:

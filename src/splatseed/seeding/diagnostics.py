@@ -17,6 +17,7 @@ from splatseed.depthmap import in_scene_units
 from splatseed.errors import SplatseedError
 from splatseed.findings import Finding
 from splatseed.methods.neighbors import prepare, sound_bases
+from splatseed.photos.view import surface_pixels
 from splatseed.photos.visibility import points_in_image
 from splatseed.progress import Progress, silent
 from splatseed.sampling import strided
@@ -146,8 +147,9 @@ def empty_regions(
 ) -> EmptyRegions | None:
     """Measure the area of the images without points; None for a scene without images or points.
 
-    Masked area does not count. Where there are masks, the images of the ``sample`` (read by
-    default) represent all. Occlusion is not tested: a wall with points behind it counts as covered.
+    Masked and transparent area does not count. Where there is any, the images of the ``sample``
+    (read by default) represent all. Occlusion is not tested: a wall with points behind it counts as
+    covered.
     """
     if not scene.images or not len(scene.points):
         return None
@@ -250,20 +252,19 @@ class MaskSample:
 
 def read_mask_sample(scene: Scene, progress: Progress = silent) -> MaskSample:
     """Read the masks of some photographs of a scene."""
-    if scene.masks is None:
-        return MaskSample({}, (), ())
-    files = scene.masks.files
+    files = scene.masks.files if scene.masks else {}
     images = [im for im in scene.images if (im.name in files or not files) and im.has_photograph]
     images = strided(images, MAX_MASKS_READ)
     cells: dict[str, Float64[np.ndarray, "R C"] | None] = {}
     shares, findings = list[float](), list[Finding]()
     for i, image in enumerate(images):
         try:
-            counts = image.read_mask()
+            counts, empty = image.read_mask(), image.read_empty()
         except SplatseedError as error:
             findings.append(Finding("unusable-mask", str(error), "error", (image.name,)))
             continue
-        cells[image.name] = None if counts is None else _cell_shares(image, counts)
+        surface = surface_pixels(counts, empty)
+        cells[image.name] = None if surface is None else _cell_shares(image, surface)
         if image.name in files or counts is not None:
             shares.append(0.0 if counts is None else 1.0 - float(counts.mean()))
         progress("read masks", (i + 1) / len(images))

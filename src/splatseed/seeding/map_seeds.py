@@ -73,7 +73,7 @@ def seeds_from_maps(
         covered = np.isfinite(cell_depths(view.camera, cloud.values, cell))
         empty = np.flatnonzero(~covered & np.isfinite(maps[i]))
         found = maps[i].ravel()[empty], np.ones(len(empty), np.float32)
-        seeds = make_seeds(view, cell, empty, found, view.mask)
+        seeds = make_seeds(view, cell, empty, found, view.surface)
         others = [j for j in sources[i].tolist() if j >= 0]
         seeds = seeds.select(~_seen_through(seeds.xyz, views, maps, others, cell))
         cloud.append(seeds.xyz)

@@ -332,7 +332,7 @@ def _cover(
 ) -> PointCloud:
     from splatseed.seeding.cover import cover
 
-    xyz, masks = cloud.xyz[cloud.finite], [view.mask for view in views]
+    xyz, masks = cloud.xyz[cloud.finite], [view.surface for view in views]
     return cover(views, xyz, cell=cell, rng=rng, masks=masks, progress=progress)
 
 

@@ -160,7 +160,7 @@ def _misses(view: View, other: View) -> Float64[np.ndarray, " M"]:
     # c: the translation in i's axes, as R d + w t = R (d + w R' t).
     step = view.K @ (j_from_i[:3, :3].T @ j_from_i[:3, 3])
     misses = []
-    for p in _corners(image, view.mask):
+    for p in _corners(image, view.surface):
         # d/dw of K (K^-1 p + w c) at w = 0, where a far point starts to move.
         along = step[:2] - step[2] * p
         length = np.linalg.norm(along)

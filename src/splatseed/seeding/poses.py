@@ -206,8 +206,8 @@ def _agreement(scene: Scene, images: Sequence[Image], poses: Poses, sample: int)
     shares = []
     for i, view in enumerate(stereo.views):
         confirmed = stereo.confirmed(i)
-        if view.mask is not None:
-            confirmed = confirmed[valid_blocks(view.mask, POSE_CHECK.stereo.grid)]
+        if view.surface is not None:
+            confirmed = confirmed[valid_blocks(view.surface, POSE_CHECK.stereo.grid)]
         if confirmed.size:
             shares.append(confirmed.mean())
     return float(np.mean(shares)) if shares else 0.0

@@ -17,6 +17,7 @@ from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.scene import Scene
 from splatseed.seeding.advice import DEFAULT_METHOD, method_for
 from splatseed.seeding.budget import points_within
+from splatseed.seeding.clouds.point_colors import with_colors
 from splatseed.seeding.cover import covered_share
 from splatseed.seeding.photo_methods import (
     CELL,
@@ -81,7 +82,7 @@ def upsample(
 
     Returns:
         The N originals, unchanged, then the new points; ``source`` distinguishes them. A budget
-        removes points of both kinds.
+        removes points of both kinds. Originals that lack colours get those of the photographs.
 
     Raises:
         ParameterError: Unknown method (an UnknownNameError, which is a KeyError, too), profile or
@@ -108,6 +109,7 @@ def upsample(
     if extra_method is None and DEFAULT_METHOD in {method, getattr(method, "name", None)}:
         method = method_for(scene, method, note)
     name, chosen = resolve(method, profile, parameters)
+    scene = with_colors(scene, getattr(chosen, "test_every", 0), note, progress)
     only_default = name == DEFAULT_METHOD and ratio is None and num_points is None and cover is None
     base, measured = scene, None
     if extra_method is not None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -143,6 +144,8 @@ def detect_features(run: ColmapRun, database: Any, model: Any, masks: Masks | No
     pycolmap, settings = run.pycolmap, run.settings
     names = {image_id: image.name for image_id, image in sorted(model.images.items())}
     folder = run.work / "masks"
+    if masks is not None:  # transparent pixels have no features
+        masks = replace(masks, alpha=True)
     write_masks(masks, run.image_dir, names.values(), folder)
     copy_misread(run.image_dir, names.values(), run.work / COPIES)
     masked = {"mask_path": str(folder)} if folder.is_dir() else {}

@@ -27,7 +27,7 @@ from splatseed.io.colmap_model import read_model_cameras
 from splatseed.io.depth_maps import write_lenses
 from splatseed.io.files import StrPath
 from splatseed.io.mask_files import FOLDER as MASKS
-from splatseed.io.masks import write_masks
+from splatseed.io.masks import write_masks, write_transparency
 from splatseed.io.origin import write_offset
 from splatseed.io.photograph import photograph_folder
 from splatseed.io.photograph_checks import check_sizes, with_photographs
@@ -239,6 +239,8 @@ def _export(
         return
     lenses = {name: (before[name], pinhole) for name, pinhole in after.items()}
     write_masks(masks, run.image_dir, lenses, staging / MASKS, lenses)
+    if not masks.alpha:
+        write_transparency(run.image_dir, staging / "images", lenses)
 
 
 def undistort(

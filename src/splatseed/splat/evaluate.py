@@ -29,7 +29,7 @@ from torch import Tensor
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.findings import Finding
 from splatseed.io import load_scene
-from splatseed.io.masks import with_masks
+from splatseed.io.masks import TRANSPARENT, with_masks
 from splatseed.io.photograph import photographs_digest
 from splatseed.io.photograph_checks import with_photographs
 from splatseed.photos.camera_check import reference_points
@@ -218,6 +218,7 @@ def load_model(
     if not isinstance(scene, Scene):
         scene = load_scene(Path(scene), require_points=False)
     scene = with_masks(scene, masks)
+    findings += [each for each in scene.findings if each.kind == TRANSPARENT]
     if scene.images:
         scene = _with_test_photographs(scene, test_every)
     if gone := scene.absent:

@@ -147,7 +147,7 @@ def fit_harmonics(seeds: PointCloud, views: Sequence[View]) -> Float32[np.ndarra
     right[:, 0] = INITIALIZATION.color_weight * SH_C0 * (seeds.rgb / 255.0 - 0.5)
     limit = max(INITIALIZATION.min_views, INITIALIZATION.max_projections // max(1, len(xyz)))
     for view in [views[i] for i in evenly_spaced(len(views), limit)]:
-        index, uv, _ = visible_points(view.camera, xyz, INITIALIZATION.occlusion_cell, view.mask)
+        index, uv, _ = visible_points(view.camera, xyz, INITIALIZATION.occlusion_cell, view.surface)
         column, row = uv.astype(np.int64).T
         offsets = xyz[index].astype(np.float64) - view.camera.center
         d = offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12)

@@ -134,7 +134,7 @@ def train(
             ``seed``, ``test_every``, ``backend``, ``start``, ``exposure``, ``seeding``, ...; and of
             ``TrainRequest``: ``budget`` (a number, or "0.25rho" for a quarter of a photograph's
             pixels), ``long_side`` instead of ``data_factor``, ``masks`` (a folder, "none",
-            "inverted"), ``refine_poses``, ``resume``, ``overwrite``, ``tensorboard``.
+            "inverted", "alpha"), ``refine_poses``, ``resume``, ``overwrite``, ``tensorboard``.
 
     Raises:
         ParameterError: An option is unknown or out of range, or differs from the resumed run's.
@@ -210,8 +210,8 @@ def evaluate(
         **options: Fields of ``EvaluateRequest``: ``data_factor`` and ``test_every``, by default as
             the run was trained; ``transform`` from the scene's frame to the model's (a file,
             "gsplat", "flipped", or "none" to skip the check that they agree); ``masks`` (a folder,
-            "none", "inverted"); ``lpips_weights``, a file, without which, here or in PyTorch's
-            cache, LPIPS is None; ``backend``.
+            "none", "inverted", "alpha"); ``lpips_weights``, a file, without which, here or in
+            PyTorch's cache, LPIPS is None; ``backend``.
 
     Returns:
         Means over the test views, as attributes (``psnr`` in dB, ``cc_psnr``, ``covisible_psnr``,

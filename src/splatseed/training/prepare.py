@@ -28,6 +28,7 @@ from splatseed.pointcloud import PointCloud
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.requirements import require
 from splatseed.scene import Scene
+from splatseed.seeding.clouds.point_colors import with_colors
 from splatseed.splat._kernels import WINDOW
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.training_frame import TrainingFrame, frame_of_model
@@ -109,6 +110,8 @@ def prepare_run(
     settings, folder = setup.settings, setup.folder
     posed = _at_refined_poses(scene, setup) if setup.refine_poses else scene
     triangulated = posed.points is not scene.points  # else refinement keeps them
+    if settings.start is None:
+        posed = with_colors(posed, settings.test_every, note, progress)
     scene, stereo = seeded(
         posed, settings, setup.device.type, note, progress, triangulated=triangulated
     )

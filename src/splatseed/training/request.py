@@ -18,7 +18,7 @@ from splatseed.errors import ParameterError
 from splatseed.text import did_you_mean
 from splatseed.training.settings import Backend, TrainSettings
 
-MaskChoice = Annotated[str | None, tyro.conf.arg(metavar="DIR|none|inverted[:DIR]")]
+MaskChoice = Annotated[str | None, tyro.conf.arg(metavar="DIR|none|inverted[:DIR]|alpha")]
 """The masks to use: see ``io.masks.with_masks``."""
 DEFAULTS = TrainSettings(strategy="auto", seeding="advised")
 """The settings of a new run of ``train``, those that score best; a resumed run has its own.
@@ -62,7 +62,8 @@ class TrainRequest(PrepareOptions):
     pixels on a photograph's longer side."""
     masks: MaskChoice = None
     """A folder of masks, where pixels of 0 do not count, or none; inverted: only they count. By
-    default the folder masks beside the photographs, and transparency."""
+    default the folder masks beside the photographs. Transparent pixels are empty space around an
+    object that is cut out, and do not count elsewhere; none: always empty, alpha: never."""
     named: tyro.conf.Suppress[frozenset[str]] = frozenset()
     """The settings that the caller named, which a run to resume must have, defaults or not."""
 
@@ -103,7 +104,9 @@ class EvaluateRequest:
     unchanged."""
     masks: MaskChoice = None
     """A folder of masks, where pixels of 0 do not count, or none; inverted: only they count. By
-    default the run's, else the folder masks beside the photographs, and transparency."""
+    default the run's, else the folder masks beside the photographs. Transparent pixels are empty
+    space around an object that is cut out, and do not count elsewhere; none: always empty, alpha:
+    never."""
     lpips_weights: Path | None = None
     """The file of VGG's weights for LPIPS, or its folder; by default PyTorch's cache."""
     backend: Backend = "auto"

@@ -80,6 +80,9 @@ def test_without_colours_free_space_drops_ghosts(room, room_capture, scan, tmp_p
     painted = Cloud(clean=False, recolor=True).of(written(tmp_path, scan))
     np.testing.assert_array_equal(new[False].rgb, new_points(ss.upsample(room, painted)).rgb)
     assert new[False].rgb.std() > 10
+    # So are those of a cloud in which all points are black.
+    black = Cloud(clean=False).of(written(tmp_path, (scan[0], np.zeros_like(scan[1]))))
+    np.testing.assert_array_equal(new[False].rgb, new_points(ss.upsample(room, black)).rgb)
 
 
 def test_a_national_grid_and_another_scale_lose_no_precision(room, scan, seeds, tmp_path):

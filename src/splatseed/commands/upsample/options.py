@@ -65,7 +65,8 @@ class Options:
     folder's own statement."""
     masks: MaskChoice = None
     """A folder of masks, where pixels of 0 do not count, or none; inverted: only they count. By
-    default the folder masks beside the photographs, and transparency."""
+    default the folder masks beside the photographs. Transparent pixels are empty space around an
+    object that is cut out, and do not count elsewhere; none: always empty, alpha: never."""
     refine_poses: bool = False
     """First refine the poses, such as a phone's or SLAM's; points triangulated there replace the
     scene's, unless refinement gains nothing."""

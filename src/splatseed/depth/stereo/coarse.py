@@ -87,8 +87,8 @@ def _downsampled(view: View) -> View:
     image = block_means(view.photograph, factor)
     K = scaled(view.K, 1 / factor)
     mask = None
-    if view.mask is not None:
-        mask = block_means(view.mask[..., None].astype(np.uint8), factor)[..., 0] > 0
+    if view.surface is not None:
+        mask = block_means(view.surface[..., None].astype(np.uint8), factor)[..., 0] > 0
     camera = Camera(K, image.shape[1], image.shape[0], view.cam_from_world)
     return View(view.name, image, camera, mask)
 

@@ -226,9 +226,9 @@ def _match_view(
         for color in range(2):
             key = rng.integers(1 << 63, dtype=np.uint64)
             red_black_sweep(quad_images, color, number, key, planes, costs)
-    if view.mask is not None:
+    if view.surface is not None:
         # Undistortion leaves borders without pixels, where planes are meaningless.
-        costs[~valid_blocks(view.mask, grid)] = np.inf
+        costs[~valid_blocks(view.surface, grid)] = np.inf
     return planes, costs
 
 

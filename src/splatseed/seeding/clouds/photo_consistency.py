@@ -190,12 +190,20 @@ def find_evidence(
                 block, view.camera.pixels_from_world,
                 np.sqrt(abs(view.K[0, 0] * view.K[1, 1])), view.width, view.height, surfaces[v],
                 behind, no_rays if free is None else free[v], view.photograph,
-                no_mask if view.mask is None else view.mask, closeness, samples,
+                no_mask if view.surface is None else view.surface, closeness, samples,
                 evidence.num_views[part], evidence.violations[part], evidence.confirmations[part],
             )  # fmt: skip
             progress("compare with photographs", (b * len(views) + v + 1) / steps)
         summarise(closeness, samples, evidence.rgb[part], evidence.agreement[part])
     return evidence
+
+
+def colors_of_points(
+    views: Sequence[View], xyz: Float32[np.ndarray, "N 3"], progress: Progress
+) -> UInt8[np.ndarray, "N 3"]:
+    """Return the colours of points in the photographs that see them; mid grey where none does."""
+    surfaces, cell = find_surfaces(views, xyz, progress)
+    return find_evidence(views, xyz, surfaces, cell, None, progress).rgb
 
 
 def surface_agreement(

@@ -27,6 +27,7 @@ from splatseed.seeding.clouds.photo_consistency import (
     consistent_voxels,
     free_space,
 )
+from splatseed.seeding.clouds.point_colors import lacks_color
 from splatseed.seeding.clouds.reading import MergedCloud, read_clouds
 from splatseed.seeding.clouds.settings import CloudInputs, CloudSettings
 from splatseed.seeding.cover import covered_share
@@ -71,7 +72,7 @@ def cloud_seeds(
     visibility = find_visibility(scene)
     none = np.empty((0, 3))
     visible = [visibility.of(image) if len(visibility.xyz) else none for image in images]
-    has_rgb = all(file.colors == "rgb" for file in merged.files)
+    has_rgb = _has_rgb(merged)
     free = _free_space(scene, images, views, visible, rng, progress) if settings.clean else None
     selected = consistent_voxels(
         views, visible, voxels, voxels.rgb if has_rgb else None, progress,
@@ -98,14 +99,21 @@ def _colors(
     settings: CloudSettings, scene: Scene, merged: MergedCloud, selected: ConsistentVoxels
 ) -> UInt8[np.ndarray, "K 3"]:
     """Return the cloud's own colours, or those of the photographs where these are better."""
-    has_rgb = all(file.colors == "rgb" for file in merged.files)
     has_any = all(file.colors != "none" for file in merged.files)
-    if not has_any or (scene.has_photographs and (settings.recolor or not has_rgb)):
+    if not has_any or (scene.has_photographs and (settings.recolor or not _has_rgb(merged))):
         return selected.evidence.rgb
     return np.asarray(merged.voxels.rgb[selected.kept])
 
 
+def _has_rgb(merged: MergedCloud) -> bool:
+    """Whether all files have colours, and not one colour for nearly all points."""
+    named = all(file.colors == "rgb" for file in merged.files)
+    return named and not lacks_color(merged.voxels.rgb).any()
+
+
 def _found_colors(merged: MergedCloud) -> str:
+    if all(file.colors == "rgb" for file in merged.files):
+        return "one colour only"
     if all(file.colors != "none" for file in merged.files):
         return "intensity only"
     if any(file.colors != "none" for file in merged.files):
