@@ -12,12 +12,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from splatseed.checkup import poses
 from splatseed.depth.stereo import coarse, matching, pipeline
 from splatseed.depth.stereo.maps import StereoResult
 from splatseed.io.staging import atomic_file
 from splatseed.photos.view import View
 from splatseed.progress import Progress
-from splatseed.seeding import poses
 
 USERS = (coarse, pipeline, poses)
 """The modules that compare photographs."""

@@ -30,8 +30,9 @@ MODULES = ["splatseed"] + [m.name for m in pkgutil.walk_packages(splatseed.__pat
 ORDER = (
     "errors", "text", "settings", "requirements", "findings", "progress", "frozen", "sampling",
     "projection", "runtime", "camera", "similarity", "lens", "pointcloud", "depthmap", "scene",
-    "scores", "io", "photos", "depth", "methods", "seeding", "synthetic", "sfm", "rendering",
-    "splat", "training", "integrations", "viewer", "bench", "console", "commands", "cli",
+    "scores", "io", "photos", "depth", "methods", "checkup", "seeding", "synthetic", "sfm",
+    "rendering", "splat", "training", "integrations", "viewer", "bench", "console", "commands",
+    "cli",
 )  # fmt: skip
 """Parts of the package: each imports only parts before it, or itself."""
 
@@ -145,7 +146,7 @@ def test_modules_of_a_part_import_each_other_in_no_circle(part):
     TopologicalSorter(modules).prepare()  # raises CycleError, which names the circle
 
 
-@pytest.mark.parametrize("part", ["photos", "depth", "methods", "seeding"])
+@pytest.mark.parametrize("part", ["photos", "depth", "methods", "checkup", "seeding"])
 def test_what_makes_seeds_needs_little(part):
     """Beside the standard library; networks may need more."""
     allowed = {"splatseed", "numpy", "jaxtyping", "numba", "scipy"}

@@ -29,12 +29,12 @@ from scipy.spatial.transform import Rotation
 
 import splatseed as ss
 from splatseed.camera import quat_from_rotation
+from splatseed.checkup.pose_accuracy import estimate_pose_error
 from splatseed.depth.stereo import stereo_depths
 from splatseed.errors import ReconstructionError, SplatseedError
 from splatseed.photos.loading import user_cache_dir
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
-from splatseed.seeding.pose_accuracy import estimate_pose_error
 from splatseed.sfm import refined
 from splatseed.similarity import fit_similarity
 

@@ -43,12 +43,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 import splatseed as ss
+from splatseed.checkup.poses import random_start
 from splatseed.errors import SplatseedError
 from splatseed.photos.loading import user_cache_dir
 from splatseed.photos.view import View
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
-from splatseed.seeding.poses import random_start
 from splatseed.splat.evaluate import EvalResult, evaluate_views
 from splatseed.training import TrainSettings, prepare_run
 from splatseed.training.run import TrainingRun

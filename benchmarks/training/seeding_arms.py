@@ -18,12 +18,12 @@ from typing import Any, Literal
 import numpy as np
 
 import splatseed as ss
+from splatseed.checkup.poses import random_start
 from splatseed.io.staging import atomic_file
 from splatseed.methods import configure
 from splatseed.pointcloud import PointCloud
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Scene, Split
-from splatseed.seeding.poses import random_start
 from splatseed.sfm import refined
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.training import TrainSettings, prepare_run

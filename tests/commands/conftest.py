@@ -14,10 +14,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from splatseed.camera import quat_from_rotation
+from splatseed.checkup import pose_accuracy, poses
 from splatseed.io import load_scene, write_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
-from splatseed.seeding import pose_accuracy, poses
 
 _compared: dict[object, object] = {}
 

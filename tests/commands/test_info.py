@@ -14,6 +14,7 @@ import pytest
 from PIL import Image as PilImage
 
 from splatseed import upsample
+from splatseed.checkup.pose_accuracy import PoseErrorEstimate
 from splatseed.commands import next_steps
 from splatseed.commands.next_steps import number_option
 from splatseed.depth.alignment import align_maps
@@ -23,7 +24,6 @@ from splatseed.io.colmap import write_points3d
 from splatseed.io.depth_maps import depth_folder
 from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
-from splatseed.seeding.pose_accuracy import PoseErrorEstimate
 from splatseed.splat.formats import write_gaussians
 from splatseed.splat.gaussians import Gaussians
 
@@ -300,7 +300,7 @@ def test_exact_poses_without_points_are_advised_to_get_points(
     assert f"--poses-from {tmp_path / 'nerf'}" in advised
     assert "--refine-poses" not in advised
     assert "nan" not in run.out
-    monkeypatch.setattr("splatseed.seeding.poses.check_poses", lambda *_: 0.08)
+    monkeypatch.setattr("splatseed.checkup.poses.check_poses", lambda *_: 0.08)
     problems = json.loads(splatseed("info", tmp_path / "nerf", "--json").out)["problems"]
     assert sum("agree on the depth of only 8%" in each for each in problems) == 1
 
@@ -316,7 +316,7 @@ def test_poses_are_measured_by_training_views_unless_these_give_no_estimate(
         measured.append([image.name for image in images])
         return None if len(measured) == 1 else PoseErrorEstimate(0.7, 0.1, False, 160)
 
-    monkeypatch.setattr("splatseed.seeding.pose_accuracy.estimate_pose_error", estimate)
+    monkeypatch.setattr("splatseed.checkup.pose_accuracy.estimate_pose_error", estimate)
     error = json.loads(splatseed("info", path, "--json").out)["poses"]["error"]
     assert error["px"] == 0.7
     assert len(train) == 14

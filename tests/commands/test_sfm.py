@@ -10,10 +10,10 @@ from dataclasses import replace
 
 import pytest
 
+from splatseed.checkup.pose_accuracy import PoseErrorEstimate
 from splatseed.commands import sfm
 from splatseed.io import load_scene
 from splatseed.io.load import with_own_depths
-from splatseed.seeding.pose_accuracy import PoseErrorEstimate
 from splatseed.sfm import Refinement, Settings, SfmReport
 from splatseed.sfm.photos import find_photos
 from splatseed.sfm.refinement import unrefined_finding

@@ -324,7 +324,7 @@ def _train(options: Options) -> bool:
 
 def _seed_poses_alone(folder: Path, clock: StageClock) -> float:
     """Write scenes whose seeds come from poses and photographs alone; return the seconds taken."""
-    from splatseed.seeding.poses import random_start
+    from splatseed.checkup.poses import random_start
 
     scene = load_scene(folder / "scene").replace(points=PointCloud.empty(), tracks=None)
     clock("seed poses alone", 0.0)

@@ -19,6 +19,7 @@ import tyro
 
 from splatseed.camera import Intrinsics
 from splatseed.commands import next_steps
+from splatseed.commands.capture_check import CaptureCheck, PoseCheck, check_capture
 from splatseed.commands.next_steps import Commands, Planned, TrainerName
 from splatseed.commands.options import check_free, parse_options, refuse
 from splatseed.console import (
@@ -32,25 +33,23 @@ from splatseed.console import (
 )
 from splatseed.depth.settings import DepthSettings
 from splatseed.depthmap import DepthKind, DepthMaps, in_scene_units
-from splatseed.errors import SplatseedError
 from splatseed.findings import Finding
 from splatseed.io import load_scene
 from splatseed.io.load import depths_beside, with_depths_in
 from splatseed.io.seeds import was_upsampled
 from splatseed.photos.camera_check import stray_cameras
-from splatseed.progress import Progress
+from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.seeding import diagnostics
 from splatseed.seeding.advice import Advice, advice_for, is_distorted, untrainable
 from splatseed.seeding.clouds.point_colors import missing_color_findings
-from splatseed.seeding.photo_methods import has_points, photographed
+from splatseed.seeding.photo_methods import photographed
 from splatseed.text import counted, quoted, visible
 from splatseed.training.folder import RunFolder
 from splatseed.training.schedule import FULL_RUN
 
 if TYPE_CHECKING:  # Numba, which takes a while to load, comes with it
     from splatseed.depth.alignment import Alignment
-    from splatseed.seeding.pose_accuracy import PoseErrorEstimate
 
 KINDS_SHOWN = 3
 """Kinds of cameras listed; collections of photographs from the web have one per photograph."""
@@ -83,8 +82,36 @@ class Options:
     """Steps that you plan to train, for the commands that are printed."""
     trainer: Annotated[TrainerName, tyro.conf.arg(name="for")] = "splatseed"
     """The trainer that you plan to use: the advice and the commands are for it."""
+    all_photographs: bool = False
+    """Compare all photographs with the points, not 100 at most, to find single wrong poses."""
     json: bool = False
     """Print one JSON object instead, for scripts."""
+
+
+@dataclass(frozen=True)
+class _Facts:
+    """What is measured of a scene."""
+
+    cloud: diagnostics.CloudStatistics
+    tracks: diagnostics.TrackStatistics | None
+    masks: diagnostics.MaskStatistics
+    regions: diagnostics.EmptyRegions | None
+    alignments: Mapping[str, Alignment] | None  # of --depth with the points
+    known: int  # pixels of the maps with a depth
+    maps: diagnostics.DepthMapStatistics | None
+    beside: int  # depth maps beside the photographs
+    check: CaptureCheck
+    unusable_maps: bool  # they are in another unit, or cannot be aligned
+    problems: tuple[Finding, ...]
+
+    def verdict(self, scene: Scene) -> str:
+        return with_options(self.check.verdict(scene, self.problems))
+
+    def usable(self, scene: Scene) -> Scene:
+        """Return the scene without the points and depth maps that cannot be used."""
+        if self.unusable_maps:
+            scene = scene.replace(depths=None)
+        return scene.with_points(PointCloud.empty()) if self.check.unfit_points else scene
 
 
 def run(arguments: list[str]) -> None:
@@ -95,57 +122,74 @@ def run(arguments: list[str]) -> None:
     with stage_display() as clock:
         clock("read", 0.0)
         scene = _read(options)
-        cloud = diagnostics.cloud_statistics(scene, clock)
-        tracks = diagnostics.track_statistics(scene)
-        sample = diagnostics.read_mask_sample(scene, clock)
-        masks = diagnostics.mask_statistics(scene, sample)
-        regions = diagnostics.empty_regions(scene, clock, sample)
-        # An empty part is reason to upsample, which was done.
-        empty = None if was_upsampled(scene) else regions
-        problems = [*diagnostics.find_problems(scene, cloud, empty)]
-        problems += missing_color_findings(scene)
-        alignments = None if options.depth is None else _alignments(options, scene, clock)
-        known = _known_depths(scene.depths, clock) if options.depth and scene.depths else 0
-        maps = diagnostics.depth_map_statistics(scene, clock)
-        beside = len(depths_beside(scene) or ())
-        poses = _check_poses(scene, masks.share, clock)
-        mismatch = _unit_mismatch(scene, poses)
+        facts = _measure(options, scene, clock)
+    if options.json:
+        print(json.dumps(_json(scene, facts), indent=2, allow_nan=False), file=OUT.file)
+        return
+    _show(options, scene, facts)
+
+
+def _measure(options: Options, scene: Scene, clock: StageClock) -> _Facts:
+    cloud = diagnostics.cloud_statistics(scene, clock)
+    tracks = diagnostics.track_statistics(scene)
+    sample = diagnostics.read_mask_sample(scene, clock)
+    masks = diagnostics.mask_statistics(scene, sample)
+    regions = diagnostics.empty_regions(scene, clock, sample)
+    # An empty part is reason to upsample, which was done.
+    empty = None if was_upsampled(scene) else regions
+    problems = [*diagnostics.find_problems(scene, cloud, empty)]
+    problems += missing_color_findings(scene)
+    alignments = None if options.depth is None else _alignments(options, scene, clock)
+    known = _known_depths(scene.depths, clock) if options.depth and scene.depths else 0
+    maps = diagnostics.depth_map_statistics(scene, clock)
+    beside = len(depths_beside(scene) or ())
+    check = check_capture(scene, masks.share, clock, all_photographs=options.all_photographs)
+    mismatch = _unit_mismatch(scene, check.poses)
     if maps is not None and mismatch:
         maps = replace(maps, in_scene_units=False)
-    problems += [*stray_cameras(scene), *masks.findings, *_unfit_maps(scene, alignments or {})]
-    problems += [*(poses.findings if poses else ()), *mismatch]
-    if options.json:
-        facts = {
-            "points": cloud, "tracks": tracks, "empty": regions, "poses": poses, "masks": masks,
-            "depth_map_statistics": maps, "depth": alignments,
-            "problems": [with_options(str(each)) for each in problems], "findings": problems,
-        }  # fmt: skip
-        facts = _plain({**_facts_of(scene), **facts})
-        print(json.dumps(facts, indent=2, allow_nan=False), file=OUT.file)
-        return
-    usable = scene
     unfit = bool(alignments) and all(each.rejected for each in (alignments or {}).values())
-    if mismatch or (unfit and len(scene.points)):
-        usable = scene.replace(depths=None)  # nothing follows from maps that cannot be used
+    problems += [*stray_cameras(scene), *masks.findings, *_unfit_maps(scene, alignments or {})]
+    problems += [*check.findings, *mismatch]
+    return _Facts(
+        cloud, tracks, masks, regions, alignments, known, maps, beside, check,
+        bool(mismatch) or (unfit and len(scene.points) > 0), tuple(problems),
+    )  # fmt: skip
+
+
+def _json(scene: Scene, facts: _Facts) -> Any:
+    problems = [with_options(str(each)) for each in facts.problems]
+    own = {
+        "verdict": facts.verdict(scene), "checkup": facts.check.facts, "points": facts.cloud,
+        "tracks": facts.tracks, "empty": facts.regions, "poses": facts.check.poses,
+        "masks": facts.masks, "depth_map_statistics": facts.maps, "depth": facts.alignments,
+        "problems": problems, "findings": facts.problems,
+    }  # fmt: skip
+    return _plain({**_facts_of(scene), **own})
+
+
+def _show(options: Options, scene: Scene, facts: _Facts) -> None:
+    check, usable, problems = facts.check, facts.usable(scene), facts.problems
     planned = Planned.of(usable, options.budget, options.max_steps, options.trainer)
-    share = None if regions is None else regions.mean
-    advice = advice_for(
-        usable, planned.max_seeds, why_no_seeds=planned.strategy.why_no_seeds, empty=share
-    )
-    rows = [*_source_rows(scene), *_depth_map_rows(maps, beside)]
-    rows += [*_cloud_rows(cloud), *_track_rows(tracks)]
-    rows += _photograph_rows(regions, poses, masks)
-    rows += _advice_rows(advice, planned) if len(scene.points) else []
+    advice = _advice(usable, planned, facts)
+    OUT.print(facts.verdict(scene), style="bold", soft_wrap=True)
+    rows = [*_source_rows(scene), *_depth_map_rows(facts.maps, facts.beside)]
+    rows += [*_cloud_rows(facts.cloud), *_track_rows(facts.tracks)]
+    rows += [*check.rows, *_photograph_rows(facts.regions, check.poses, facts.masks)]
+    if len(scene.points):
+        rows += [("advice", check.first)] if check.first else _advice_rows(advice, planned)
     print_pairs(str(options.scene), rows)
-    if alignments is not None:
-        _print_depth(str(options.depth), scene, alignments)
+    if facts.alignments is not None:
+        _print_depth(str(options.depth), scene, facts.alignments)
     _print_list("problems" if problems else "no problems found", [*map(str, problems)])
     if options.picture is not None:
         print_pairs("picture", [("of depth", str(options.picture))])
     if len(scene.points) or scene.images:
         if missing := untrainable(scene):
             print_note(missing)
-        print_pairs("next", _next(options, usable, advice, planned, known, poses))
+        commands = _next(options, usable, advice, planned, facts.known, check.poses)
+        if check.first and len(scene.points):
+            commands = [("once that is mended", f"splatseed info {quoted(options.scene)}")]
+        print_pairs("next", commands)
 
 
 def _shows_model(options: Options) -> bool:
@@ -231,61 +275,19 @@ def _unfit_maps(scene: Scene, alignments: Mapping[str, Alignment]) -> list[Findi
     return [Finding("unfit-depth-maps", text, subjects=unfit)] if unfit else []
 
 
-@dataclass(frozen=True)
-class _PoseCheck:
-    """What comparing a few photographs shows about the poses."""
-
-    agreement: float  # fraction of the compared pixels whose depth other photographs confirm
-    error: PoseErrorEstimate | None
-    doubts: tuple[Finding, ...] = ()  # why the poses may be wrong
-    faint: tuple[Finding, ...] = ()  # that photographs agree at few pixels
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        return (*self.doubts, *self.faint)
-
-    @property
-    def inexact(self) -> bool:
-        """Whether refinement may correct the poses."""
-        from splatseed.seeding.pose_accuracy import INEXACT_POSES
-
-        return any(each.kind == INEXACT_POSES for each in self.doubts)
-
-    @property
-    def facts(self) -> dict[str, Any]:
-        """What ``--json`` prints."""
-        problem = with_options("".join(map(str, self.doubts)))
-        return {"agreement": self.agreement, "error": self.error, "problem": problem}
+def _advice(scene: Scene, planned: Planned, facts: _Facts) -> Advice:
+    """Advise on the points, or on a scene without those that photographs contradict."""
+    share = None if facts.regions is None else facts.regions.mean
+    advice = advice_for(
+        scene, planned.max_seeds, why_no_seeds=planned.strategy.why_no_seeds, empty=share
+    )
+    if not facts.check.unfit_points:
+        return advice
+    reasons = ("Photographs contradict its points, so seeds come from the photographs alone.",)
+    return replace(advice, reasons=reasons)
 
 
-def _check_poses(scene: Scene, masked: float, progress: Progress) -> _PoseCheck | None:
-    """Compare a few photographs of a scene; None without photographs.
-
-    ``masked`` is the share of pixels that masks exclude. A scene with points has no doubts: it can
-    be trained from them.
-    """
-    if not scene.has_photographs:
-        return None
-    from splatseed.seeding.pose_accuracy import INEXACT_POSES, estimate_pose_error, given_pose_error
-    from splatseed.seeding.poses import InexactPosesError, agreement_findings, check_poses
-
-    try:
-        images = photographed(scene)
-        agreement = check_poses(scene, images, progress)
-    except SplatseedError as refused:
-        if has_points(scene):
-            return None
-        kind = INEXACT_POSES if isinstance(refused, InexactPosesError) else "photographs-disagree"
-        text = f"The photographs cannot be compared: {refused}"
-        return _PoseCheck(0.0, None, (Finding(kind, text, "error"),))
-    if has_points(scene):
-        return _PoseCheck(agreement, estimate_pose_error(scene, images, progress))
-    error = given_pose_error(scene, images, progress)
-    doubts = error.findings if error else ()
-    return _PoseCheck(agreement, error, doubts, agreement_findings(agreement, masked))
-
-
-def _unit_mismatch(scene: Scene, poses: _PoseCheck | None) -> tuple[Finding, ...]:
+def _unit_mismatch(scene: Scene, poses: PoseCheck | None) -> tuple[Finding, ...]:
     """Report depth maps of another unit than the poses, unless the poses cannot be checked."""
     if not in_scene_units(scene.depths) or poses is None or not poses.agreement:
         return ()
@@ -305,7 +307,7 @@ def _next(
     advice: Advice,
     planned: Planned,
     known: int,
-    poses: _PoseCheck | None,
+    poses: PoseCheck | None,
 ) -> Commands:
     """Return the next commands, or the choices if there are several."""
     any_points, refine = len(scene.points) > 0, poses is not None and poses.inexact
@@ -354,7 +356,7 @@ def _facts_of(scene: Scene) -> dict[str, Any]:
 
 def _plain(value: Any) -> Any:
     """Convert a value for JSON: a dataclass to an object, a number that is not finite to null."""
-    if isinstance(value, _PoseCheck):
+    if isinstance(value, PoseCheck):
         value = value.facts
     if is_dataclass(value) and not isinstance(value, type):
         value = asdict(value)
@@ -438,7 +440,7 @@ def _track_rows(tracks: diagnostics.TrackStatistics | None) -> list[tuple[str, s
 
 def _photograph_rows(
     regions: diagnostics.EmptyRegions | None,
-    poses: _PoseCheck | None,
+    poses: PoseCheck | None,
     masks: diagnostics.MaskStatistics,
 ) -> list[tuple[str, str]]:
     rows = []
@@ -450,7 +452,7 @@ def _photograph_rows(
         grid = f"(of cells, {diagnostics.EMPTY_CELLS} along the longer side)"
         rows.append(("image area without points", f"{regions.mean:.0%} on average, {worst} {grid}"))
     if poses and (poses.error is not None or not poses.doubts):
-        from splatseed.seeding.poses import agreement_findings
+        from splatseed.checkup.poses import agreement_findings
 
         few = bool(agreement_findings(poses.agreement))
         agreed = f"at {poses.agreement:.0%} of the pixels compared: {'few' if few else 'enough'}"

@@ -29,7 +29,7 @@ from splatseed.sfm.photos import pick_frames
 from splatseed.text import counted, name_some, quoted, visible
 
 if TYPE_CHECKING:  # Numba, for which --help would wait, comes with it
-    from splatseed.seeding.pose_accuracy import PoseErrorEstimate
+    from splatseed.checkup.pose_accuracy import PoseErrorEstimate
 
 SHOWN = 3
 """Images of each kind that are named where they are left out."""
@@ -218,8 +218,8 @@ def _report_photographs(
 
 def _pose_error(report: SfmReport, clock: StageClock) -> PoseErrorEstimate | None:
     """Measure the poses by corners that SfM did not use: wrong ones can fit its own points."""
+    from splatseed.checkup.pose_accuracy import estimate_pose_error
     from splatseed.seeding.photo_methods import photographed
-    from splatseed.seeding.pose_accuracy import estimate_pose_error
 
     scene = load_scene(report.path, require_points=False)
     return estimate_pose_error(scene, photographed(scene), clock)

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
+from splatseed.checkup.poses import compare_samples
 from splatseed.depth._kernels import find_edges
 from splatseed.depth.alignment import LIMITS, map_camera
 from splatseed.depth.settings import DepthSettings
@@ -32,7 +33,6 @@ from splatseed.progress import Progress, in_threads, silent
 from splatseed.projection import denormalized, normalized, pixel_centers, project
 from splatseed.scene import Image, Scene
 from splatseed.seeding.cover import GrowableArray, make_seeds
-from splatseed.seeding.poses import compare_samples
 from splatseed.text import agreeing, counted, name_some
 
 CellMap = Float32[np.ndarray, "rows cols"]

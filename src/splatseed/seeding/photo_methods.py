@@ -353,8 +353,8 @@ def _check_given_poses(
     scene: Scene, images: Sequence[Image], progress: Progress
 ) -> tuple[Finding, ...]:
     """Check the poses of a scene without points."""
-    from splatseed.seeding.pose_accuracy import given_pose_error
-    from splatseed.seeding.poses import agreement_findings, check_poses
+    from splatseed.checkup.pose_accuracy import given_pose_error
+    from splatseed.checkup.poses import agreement_findings, check_poses
 
     faint = agreement_findings(check_poses(scene, images, progress), stated=True)
     error = given_pose_error(scene, images, progress)

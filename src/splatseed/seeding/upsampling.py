@@ -6,12 +6,15 @@ result. Both are optional.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from splatseed.checkup.choices import UnfitPoints
+from splatseed.checkup.examination import with_fitting_points
 from splatseed.errors import ParameterError
 from splatseed.findings import Finding
-from splatseed.methods import Profile, Upsampler, add_points, check_seed, resolve
+from splatseed.methods import Profile, Upsampler, add_points, check_seed, resolve, traits_of
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.scene import Scene
@@ -22,6 +25,7 @@ from splatseed.seeding.cover import covered_share
 from splatseed.seeding.photo_methods import (
     CELL,
     MAX_SIZE,
+    PhotographMethod,
     frames_of,
     photographed,
     read_views,
@@ -48,12 +52,15 @@ def upsample(
     extra_method: Upsampler | None = None,
     seed: int = 0,
     profile: Profile = "default",
+    unfit_points: UnfitPoints = "drop",
     progress: Progress = silent,
     note: Note = silent_note,
     on_stereo: Callable[[StereoResult], None] | None = None,
     **parameters: Any,
 ) -> PointCloud:
     """Add points to a scene.
+
+    Points that the photographs contradict are left out first.
 
     Args:
         scene: A scene or a cloud. New points start from originals (``source`` 0) and replace all
@@ -73,6 +80,8 @@ def upsample(
             those of ``method``, and "auto", "stereo" and "cover" only fill the gaps between them.
         seed: Seed of all random draws; the same seed gives the same bytes on any number of threads.
         profile: "default", or "paper" for the parameters and equations of the paper's text.
+        unfit_points: What to do with points that photographs contradict: "drop" them, "move" them
+            by the similarity that fits, or "keep" them, as methods that interpolate always do.
         progress: Called with the stage and the fraction done.
         note: Called with a ``Finding`` for each thing that was chosen, replaced or left out. Before
             photographs are compared again, ``second-comparison`` gives its time and memory.
@@ -89,7 +98,8 @@ def upsample(
             parameter, or a value out of range.
         PointCloudError: Too few distinct finite points for the method.
         SceneNotFoundError: The method needs photographs or depth maps that do not exist.
-        SceneFormatError: A photograph or depth map is damaged or does not fit the scene.
+        SceneFormatError: A photograph or depth map is damaged or does not fit the scene, or poses
+            are of another convention.
 
     Example:
         >>> import numpy as np, splatseed as ss
@@ -101,6 +111,49 @@ def upsample(
     """
     scene = _as_scene(scene)
     check_seed(seed)
+    chosen = resolve(method, profile)[1]
+    if "test_every" in parameters and isinstance(chosen, PhotographMethod):
+        chosen = dataclasses.replace(chosen, test_every=parameters["test_every"])
+    scene, findings = checked_points(scene, chosen, unfit_points, progress)
+    for finding in findings:
+        note(finding)
+    return upsample_checked(
+        scene, method, ratio=ratio, num_points=num_points, budget=budget, cover=cover,
+        extra_method=extra_method, seed=seed, profile=profile, progress=progress, note=note,
+        on_stereo=on_stereo, **parameters,
+    )  # fmt: skip
+
+
+def checked_points(
+    scene: Scene, method: Upsampler, unfit_points: UnfitPoints, progress: Progress
+) -> tuple[Scene, tuple[Finding, ...]]:
+    """Examine a scene, and leave out or move points that do not fit; also return findings.
+
+    Points that a method interpolates are not left out.
+    """
+    if unfit_points == "drop" and "points" in traits_of(method).needs:
+        unfit_points = "keep"
+    test_every = getattr(method, "test_every", 0)
+    return with_fitting_points(scene, unfit_points, progress, test_every=test_every)
+
+
+def upsample_checked(
+    scene: Scene,
+    method: str | Upsampler = DEFAULT_METHOD,
+    *,
+    ratio: float | None = None,
+    num_points: int | None = None,
+    budget: int | str | None = None,
+    cover: int | None = None,
+    extra_method: Upsampler | None = None,
+    seed: int = 0,
+    profile: Profile = "default",
+    progress: Progress = silent,
+    note: Note = silent_note,
+    on_stereo: Callable[[StereoResult], None] | None = None,
+    **parameters: Any,
+) -> PointCloud:
+    """Add points to a scene whose points have been examined: see ``upsample``."""
     if added := len(scene.points) - scene.points.num_original:
         verb = agreeing(added, "is", "are")
         text = f"{counted(added, 'point')} added before upsampling {verb} left out."

@@ -15,6 +15,8 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
+from splatseed.checkup.examination import with_fitting_points
+from splatseed.checkup.wrong_poses import without_wrong_poses
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.findings import Finding
 from splatseed.io import load_scene
@@ -50,7 +52,7 @@ from splatseed.training.folder import RunFolder
 from splatseed.training.initialization import first_gaussians
 from splatseed.training.request import NEW_RUN, PrepareOptions
 from splatseed.training.run import TrainingRun
-from splatseed.training.seeds import seeded, seeds_facts, usable_seeds
+from splatseed.training.seeds import no_seeding_reason, seeded, seeds_facts, usable_seeds
 from splatseed.training.settings import TrainSettings
 from splatseed.training.start import continued_gaussians, read_start, start_facts
 from splatseed.training.state import TrainState, first_state, load_checkpoint, make_strategy
@@ -113,7 +115,12 @@ def prepare_run(
     if settings.start is None:
         posed = with_colors(posed, settings.test_every, note, progress)
     scene, stereo = seeded(
-        posed, settings, setup.device.type, note, progress, triangulated=triangulated
+        _checked_up(posed, setup),
+        settings,
+        setup.device.type,
+        note,
+        progress,
+        triangulated=triangulated,
     )
     initial = _initial(scene, setup)
     frame = initial.frame(scene, settings)
@@ -180,6 +187,29 @@ def _open_folder(
     protect = [*scene.source.inputs, *([Path(settings.start)] if settings.start else [])]
     folder.check(overwrite=options.overwrite, resume=options.resume, protect=protect)
     return folder, folder.read_config() if options.resume and folder.is_run else None
+
+
+def _checked_up(scene: Scene, setup: _Setup) -> Scene:
+    """Leave out or move points that photographs contradict, unless the run starts from them.
+
+    Photographs with wrong poses are left out if the settings say so.
+    """
+    if setup.settings.drop_wrong_poses:
+        scene, wrong = without_wrong_poses(scene, setup.progress)
+        for finding in wrong:
+            setup.note(finding)
+    if was_upsampled(scene):  # which examined the points
+        return scene
+    settings, unfit_points = setup.settings, setup.settings.unfit_points
+    starts_from_points = settings.seeding == "scene" or no_seeding_reason(scene, settings)
+    if unfit_points == "drop" and starts_from_points:
+        unfit_points = "keep"
+    scene, findings = with_fitting_points(
+        scene, unfit_points, setup.progress, test_every=settings.test_every
+    )
+    for finding in findings:
+        setup.note(finding)
+    return scene
 
 
 def _initial(scene: Scene, setup: _Setup) -> _Seeds | _Start:

@@ -24,7 +24,7 @@ from splatseed.scene import Scene
 from splatseed.seeding.advice import AS_IT_IS, advice_for
 from splatseed.seeding.photo_methods import Auto
 from splatseed.seeding.thinning import thin
-from splatseed.seeding.upsampling import upsample
+from splatseed.seeding.upsampling import upsample_checked
 from splatseed.training.depths import stereo_size
 from splatseed.training.settings import BUDGET, TrainSettings
 
@@ -64,7 +64,7 @@ def seeded(
     start = time.perf_counter()
     size = stereo_size(scene.split(settings.test_every)[0], settings, device)
     stereo: list[StereoResult] = []
-    cloud = upsample(
+    cloud = upsample_checked(
         scene,
         Auto(test_every=settings.test_every, max_size=size, dense=False),
         budget=None if settings.cap is None else settings.max_seeds(settings.cap),

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from splatseed.checkup.choices import UnfitPoints
 from splatseed.findings import Finding
 from splatseed.photos.sizes import TRAINED_SIDE, default_factor
 from splatseed.progress import Note, silent_note
@@ -96,6 +97,14 @@ class TrainSettings:
     """Start from the scene's points as they are (scene), with those that method auto adds from the
     training photographs (auto), or as splatseed info advises for this strategy and budget
     (advised). Points that splatseed has added already, and 3DGS's conventions, are left alone."""
+
+    unfit_points: UnfitPoints = "drop"
+    """What to do with the scene's points where photographs contradict them: leave them out, move
+    them by the similarity that fits, or keep them."""
+
+    drop_wrong_poses: bool = False
+    """Leave out single photographs whose poses do not fit the points that other photographs
+    confirm."""
 
     def __post_init__(self) -> None:
         check_settings(self)

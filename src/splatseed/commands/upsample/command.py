@@ -71,7 +71,7 @@ def run(arguments: list[str]) -> None:
 
 
 def _upsample(options: Options, methods: dict[str, Any], arguments: list[str]) -> None:
-    from splatseed.seeding.upsampling import upsample
+    from splatseed.seeding.upsampling import upsample_checked
 
     notes: list[Finding] = []
     with stage_display() as clock:
@@ -85,6 +85,7 @@ def _upsample(options: Options, methods: dict[str, Any], arguments: list[str]) -
             scene, refinement = _refined(options, scene, methods[options.method], clock)
             replaced = 0 if scene.points is own else len(own)
             notes.append(refinement)
+        scene = _checked_up(options, scene, methods[options.method], note, clock)
         if options.recenter:
             scene = _recentered(scene, note)
         if options.method == DEFAULT_METHOD:  # it needs photographs
@@ -103,7 +104,7 @@ def _upsample(options: Options, methods: dict[str, Any], arguments: list[str]) -
     number = report.number_summary(total, limit, covered=options.cover_cell is not None)
     _announce(options, scene, replaced, methods, number, "" if cloud is None else cloud.memory_note)
     with stage_display(clock):
-        seeds = upsample(
+        seeds = upsample_checked(
             scene, method, num_points=total, budget=options.budget, cover=options.cover_cell,
             extra_method=extra_method, seed=options.seed, progress=clock,
             note=note,
@@ -138,6 +139,22 @@ def _keep_or_announce(notes: list[Finding], clock: StageClock) -> Note:
         (clock.announce if finding.kind == SECOND_COMPARISON else notes.append)(finding)
 
     return note
+
+
+def _checked_up(
+    options: Options, scene: Scene, method: Upsampler, note: Note, clock: StageClock
+) -> Scene:
+    """Leave out or move points, and photographs, that do not fit the others."""
+    from splatseed.checkup.wrong_poses import without_wrong_poses
+    from splatseed.seeding.upsampling import checked_points
+
+    findings: tuple[Finding, ...] = ()
+    if options.drop_wrong_poses:
+        scene, findings = without_wrong_poses(scene, clock)
+    scene, unfit = checked_points(scene, method, options.unfit_points, clock)
+    for finding in (*findings, *unfit):
+        note(finding)
+    return scene
 
 
 def _recentered(scene: Scene, note: Note) -> Scene:

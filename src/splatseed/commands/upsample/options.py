@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from splatseed.checkup.choices import UnfitPoints
 from splatseed.commands.options import check_minimum, parse_options, parse_some, refuse
 from splatseed.depthmap import DepthKind
 from splatseed.methods import METHODS, Profile, Upsampler, configure
@@ -70,6 +71,12 @@ class Options:
     refine_poses: bool = False
     """First refine the poses, such as a phone's or SLAM's; points triangulated there replace the
     scene's, unless refinement gains nothing."""
+    unfit_points: UnfitPoints = "drop"
+    """What to do with the scene's points where photographs contradict them: leave them out, move
+    them by the similarity that fits, or keep them."""
+    drop_wrong_poses: bool = False
+    """Leave out single photographs whose poses do not fit the points that other photographs
+    confirm."""
     cloud_files: Annotated[
         tyro.conf.UseAppendAction[tuple[Path, ...]],
         tyro.conf.arg(name="cloud", metavar="FILE", help_behavior_hint="(repeatable)"),

@@ -12,11 +12,11 @@ from scipy.ndimage import zoom
 from scipy.spatial.transform import Rotation
 
 from splatseed.camera import quat_from_rotation
+from splatseed.checkup import poses as module
+from splatseed.checkup.poses import CORRECTIONS, agreement_findings, check_poses, random_start
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.pointcloud import PointCloud
-from splatseed.seeding import poses as module
-from splatseed.seeding.poses import CORRECTIONS, agreement_findings, check_poses, random_start
 from splatseed.seeding.upsampling import upsample
 
 YZ, XY = np.diag([1.0, -1.0, -1.0, 1.0]), np.diag([-1.0, -1.0, 1.0, 1.0])

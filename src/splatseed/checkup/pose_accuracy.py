@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.ndimage import gaussian_filter, maximum_filter, sobel
 
+from splatseed.checkup._kernels import correlate_patch, interpolate
 from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.findings import Finding
 from splatseed.photos.loading import load_views
@@ -26,7 +27,6 @@ from splatseed.progress import Progress, silent
 from splatseed.projection import pixel_centers
 from splatseed.sampling import evenly_spaced
 from splatseed.scene import Image, Scene
-from splatseed.seeding._kernels.correlation import correlate_patch, interpolate
 
 Gray = Float64[np.ndarray, "H W"]
 Pixel = Float64[np.ndarray, " 2"]

@@ -9,10 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from splatseed.camera import quat_from_rotation
+from splatseed.checkup import pose_accuracy as module
+from splatseed.checkup.pose_accuracy import estimate_pose_error
+from splatseed.checkup.poses import check_poses
 from splatseed.pointcloud import PointCloud
-from splatseed.seeding import pose_accuracy as module
-from splatseed.seeding.pose_accuracy import estimate_pose_error
-from splatseed.seeding.poses import check_poses
 
 
 def _posed(scene, poses):

@@ -1,4 +1,4 @@
-"""Check the poses of scenes without points, and draw the random points that trainers start from.
+"""Check poses by comparing photographs, and draw the random points that trainers start from.
 
 The *agreement* of a photograph is the fraction of its pixels whose depth other photographs confirm,
 by stereo over all depths on photographs of ``side`` pixels. Masked pixels do not count. A scene is
@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.camera import Camera
+from splatseed.checkup.pose_accuracy import estimate_pose_error
 from splatseed.depth.stereo.coarse import prior_from_baseline
 from splatseed.depth.stereo.maps import StereoResult, StereoSettings
 from splatseed.depth.stereo.matching import match_views, valid_blocks
@@ -31,7 +32,6 @@ from splatseed.progress import Progress, silent
 from splatseed.projection import camera_centers, pixel_centers
 from splatseed.sampling import strided
 from splatseed.scene import Image, Scene
-from splatseed.seeding.pose_accuracy import estimate_pose_error
 from splatseed.text import quoted
 
 Poses = Float64[np.ndarray, "V 4 4"]
@@ -81,6 +81,10 @@ CORRECTIONS: Mapping[str, Callable[[Poses], Poses]] = MappingProxyType(
 )
 
 
+class WrongConventionError(SceneFormatError):
+    """Photographs agree clearly better once a common mistake of convention is undone."""
+
+
 class InexactPosesError(SceneFormatError):
     """Photographs agree nowhere, and their poses miss by an error that refinement can correct."""
 
@@ -111,7 +115,7 @@ def check_poses(scene: Scene, images: Sequence[Image], progress: Progress = sile
         best = max(corrected, key=lambda name: corrected[name])
         if corrected[best] >= max(clear * agreement, POSE_CHECK.min_corrected):
             found = f"a depth that others confirm at {agreement:.1%} of their pixels"
-            raise SceneFormatError(
+            raise WrongConventionError(
                 expected,
                 found=f"{found}, and at {corrected[best]:.0%} once {best}",
                 fix=f"Write the poses so: {scene.source.convention}.",

@@ -1,0 +1,1 @@
+"""The check-up: photographs, poses, intrinsics and points of a capture held against each other."""
