@@ -58,6 +58,8 @@ class Kind:
 
     def __call__(self, cloud, **options):
         """Upsample ``cloud``, four times unless told otherwise; in a made scene if it takes one."""
+        if self.needs_scene:  # whose photographs, all alike, contradict its points
+            options["unfit_points"] = "keep"
         whole = scene_around(cloud) if self.needs_scene else cloud
         return ss.upsample(whole, self.method, profile=self.profile, **options)
 
