@@ -8,6 +8,8 @@ import numpy as np
 
 import splatseed as ss
 from splatseed.methods.neighbors import prepare_scene
+from splatseed.scene import Scene
+from splatseed.seeding.upsampling import upsample_checked
 
 from .surroundings import scene_around
 
@@ -58,10 +60,11 @@ class Kind:
 
     def __call__(self, cloud, **options):
         """Upsample ``cloud``, four times unless told otherwise; in a made scene if it takes one."""
-        if self.needs_scene:  # whose photographs, all alike, contradict its points
-            options["unfit_points"] = "keep"
-        whole = scene_around(cloud) if self.needs_scene else cloud
-        return ss.upsample(whole, self.method, profile=self.profile, **options)
+        if self.needs_scene:  # whose photographs, all alike, contradict its points: not examined
+            scene = scene_around(cloud)
+            scene = scene if isinstance(scene, Scene) else Scene(scene)
+            return upsample_checked(scene, self.method, profile=self.profile, **options)
+        return ss.upsample(cloud, self.method, profile=self.profile, **options)
 
     def new(self, cloud, num_new, **options):
         """Only the new points."""
