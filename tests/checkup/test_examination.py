@@ -52,7 +52,7 @@ def _kinds(findings):
 def test_points_that_photographs_confirm_fit(room, tracked):
     scene = room if tracked else room.replace(tracks=None)
     checkup = examine(scene, comparable(scene))
-    assert checkup.vouches
+    assert checkup.confirms_poses
     assert not checkup.findings
     assert checkup.fit.support > 0.3
 
@@ -60,14 +60,14 @@ def test_points_that_photographs_confirm_fit(room, tracked):
 def test_colours_are_not_needed(room):
     black = room.points.replace(rgb=np.zeros_like(room.points.rgb))
     checkup = examine(room.with_points(black), comparable(room))
-    assert checkup.vouches
+    assert checkup.confirms_poses
     assert np.isnan(checkup.fit.color_error)
 
 
 def test_the_same_is_found_in_any_unit(room):
     images = tuple(replace(each, translation=1000 * each.translation) for each in room.images)
     scene = _with_positions(room, 1000.0 * room.points.xyz).replace(images=images)
-    assert examine(scene, comparable(scene)).vouches
+    assert examine(scene, comparable(scene)).confirms_poses
 
 
 @pytest.mark.parametrize("name", CORRECTIONS)

@@ -1,6 +1,6 @@
 """The examination: photographs, poses, intrinsics and points held against each other, in seconds.
 
-Points that photographs support (``consistency``) vouch for poses and intrinsics. Where they do not,
+Points that photographs support (``consistency``) confirm poses and intrinsics. Where they do not,
 what people's tools do to a capture is tried, in this order: focal lengths of another size; poses of
 another convention, by comparing photographs without the points, which refuses the capture; points
 in other axes, or of another scale. Points count as *unfit* only if photographs agree at the poses
@@ -37,8 +37,8 @@ class _Settings:
 
     min_support: float = 0.2
     """Support of points that fit; nine captures have 0.39 and more."""
-    min_vouching: int = 30
-    """Minimum number of points compared, to vouch for the poses."""
+    min_confirming: int = 30
+    """Minimum number of points compared, to confirm the poses."""
     max_color_error: float = 0.45
     """Colour error of points that are not called unfit, whatever their support."""
     max_unfit: float = 0.1
@@ -68,8 +68,8 @@ class CheckUp:
     findings: tuple[Finding, ...] = ()
 
     @property
-    def vouches(self) -> bool:
-        """Whether the points vouch for the poses."""
+    def confirms_poses(self) -> bool:
+        """Whether the points confirm the poses."""
         return self.points == "fit"
 
 
@@ -104,7 +104,7 @@ def _examine(scene: Scene, images: Sequence[Image], progress: Progress) -> Check
     progress("check points", 0.0)
     evidence = Evidence(scene, images)
     fit = evidence.fit(evidence.given)
-    enough = fit.tested >= EXAMINATION.min_vouching
+    enough = fit.tested >= EXAMINATION.min_confirming
     fits = fit.support >= EXAMINATION.min_support and enough
     if fit.tested and (found := find_intrinsics(evidence, fit, nearby=fits)):
         finding = _focal_finding(images, fit, found)

@@ -58,7 +58,7 @@ class _Settings:
     aligned: int = 1500
     """Maximum number of points that are aligned."""
     verified: int = 5
-    """Alignments, the nearest first, that photographs judge."""
+    """Alignments, the nearest first, that are compared with photographs."""
 
 
 SEARCH = _Settings()

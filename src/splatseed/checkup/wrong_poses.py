@@ -5,7 +5,7 @@ fraction of its points that photographs confirm, over the pairs in which it take
 wrong pose is about 0, whereas its right partners have other pairs. Where the share is at most
 ``max_share`` of the median, and that of every pair at most twice as much, the photograph is
 compared with more partners and with those before and after it by name; it is named if all of them
-say the same. Photographs that share too few points with others are not judged.
+say the same. Photographs that share too few points with others are not checked.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ class _Settings:
     points: int = 24
     """Points of a pair."""
     min_photographs: int = 6
-    """With fewer photographs none is judged."""
+    """With fewer photographs none is checked."""
     min_tested: int = 16
-    """Points that a photograph must share with others to be judged."""
+    """Points that a photograph must share with others to be checked."""
     min_median: float = 0.25
-    """Median share below which no photograph is judged."""
+    """Median share below which no photograph is checked."""
     max_share: float = 0.25
     """Share of a wrong pose, as a fraction of the median."""
     max_wrong: float = 0.3

@@ -56,7 +56,7 @@ class CaptureCheck:
     """What comparing photographs with points and with each other shows."""
 
     points: CheckUp | None  # None where photographs or points are missing, or poses are refused
-    poses: PoseCheck | None  # None without photographs, or where points vouch for the poses
+    poses: PoseCheck | None  # None without photographs, or where points confirm the poses
     single: tuple[Finding, ...]  # photographs whose poses are wrong
 
     @property
@@ -110,7 +110,7 @@ class CaptureCheck:
             return f"Does not fit: {doubts[0]}"
         if not scene.has_photographs:
             return "There are no photographs to check the rest against."
-        if self.points is not None and self.points.vouches and self.points.fit is not None:
+        if self.points is not None and self.points.confirms_poses and self.points.fit is not None:
             share = self.points.fit.confirmed
             return f"Fits: photographs confirm {share:.0%} of the points compared."
         if self.poses is not None and not self.poses.faint:
@@ -140,7 +140,7 @@ def check_capture(
         points = examine(scene, comparable(scene), progress)
     except SplatseedError as error:
         refused = error
-    if points is not None and points.vouches:
+    if points is not None and points.confirms_poses:
         limit = None if all_photographs else SAMPLE
         single = find_wrong_poses(scene, comparable(scene), progress, limit)
     return CaptureCheck(points, _check_poses(scene, masked, refused, progress), single)
