@@ -104,10 +104,11 @@ class CaptureCheck:
 
     def verdict(self, scene: Scene, problems: Sequence[Finding]) -> str:
         """Say in one line whether the parts of a capture fit each other, or what does not."""
-        doubts = [each for each in problems if each.severity == "error"]
-        doubts += self.poses.doubts if self.poses else ()
-        if doubts:
-            return f"Does not fit: {doubts[0]}"
+        doubts = [*problems, *(self.poses.doubts if self.poses else ())]
+        if wrong := next((each for each in doubts if each.severity == "error"), None):
+            return f"Does not fit: {wrong}"
+        if self.poses is not None and self.poses.doubts:
+            return f"Fits roughly: {self.poses.doubts[0]}"
         if not scene.has_photographs:
             return "There are no photographs to check the rest against."
         if self.points is not None and self.points.confirms_poses and self.points.fit is not None:
