@@ -156,6 +156,7 @@ def test_a_scene_without_originals_keeps_what_its_points_are(scene, tmp_path):
     ("told", "all_of_them"),
     [
         ({"command": "upsample", "parameters": {"test_every": 0}}, True),
+        ({"command": "upsample", "parameters": {"hold_out": 0}}, True),  # as early outputs have it
         ({"command": "upsample", "parameters": {"test_every": 8}}, False),
         (
             {"command": "upsample", "parameters": {"test_every": 0}, "listed_tests_held_out": True},

@@ -107,8 +107,9 @@ def saw_all_photographs(scene: Scene) -> bool:
     """Whether ``splatseed upsample`` made new points from photographs and held none out."""
     facts = _upsampling(scene) or {}
     try:
-        all_used = facts["parameters"].get("test_every") == 0
-        all_used = all_used and not facts.get("listed_tests_held_out")
+        parameters = facts["parameters"]  # early outputs of splatseed 0.3 have hold_out
+        test_every = parameters.get("test_every", parameters.get("hold_out"))
+        all_used = test_every == 0 and not facts.get("listed_tests_held_out")
         return bool(facts["num_new"]) and all_used
     except (TypeError, KeyError, AttributeError):
         return False  # not made from photographs
