@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image as PilImage
 
 from splatseed.camera import quat_from_rotation
-from splatseed.viewer.flights import write_video
+from splatseed.viewer.videos import write_video
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 

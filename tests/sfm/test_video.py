@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import is_video
 from splatseed.sfm.photos import pick_frames
-from splatseed.viewer.flights import write_video
+from splatseed.viewer.videos import write_video
 
 HEIGHT, WIDTH = 120, 160
 STILL = 12

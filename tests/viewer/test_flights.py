@@ -24,8 +24,10 @@ from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.model_frame import find_transform, transform_gaussians
 from splatseed.splat.rendering import ModelRenderer
 from splatseed.viewer import flights
-from splatseed.viewer.flights import orbit, read_path, smooth_path
+from splatseed.viewer.camera_path import read_camera_path
+from splatseed.viewer.flights import orbit, smooth_path
 from splatseed.viewer.models import ViewerItem, open_item, pinhole_view, split_picture, viewer_frame
+from splatseed.viewer.videos import write_video
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -136,7 +138,7 @@ def test_the_path_past_sideways_cameras_is_that_past_upright_ones(room):
 def test_files_that_are_no_path_are_refused(content, tmp_path):
     (tmp_path / "path.json").write_text(content)
     with pytest.raises(SceneFormatError, match=r"\.json"):
-        read_path(tmp_path / "path.json", (64, 48))
+        read_camera_path(tmp_path / "path.json")
 
 
 # Renders ------------------------------------------------------------------------------------------
@@ -328,7 +330,7 @@ def test_a_stopped_video_leaves_no_file_and_prints_nothing(tmp_path, capfd):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt) as caught:
-        flights.write_video(tmp_path / "a.mp4", stopped(), (48, 32), 30.0)
+        write_video(tmp_path / "a.mp4", stopped(), (48, 32), 30.0)
     del caught  # and with it the frames that keep ffmpeg's pipe open
     gc.collect()
     assert capfd.readouterr().err == ""

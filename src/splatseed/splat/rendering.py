@@ -136,6 +136,13 @@ class ModelRenderer:
         """Render a view as an array, clamped to [0, 1]."""
         return np.asarray(self.image(view).clamp_(0, 1).cpu().numpy())
 
+    def premultiplied(
+        self, view: View
+    ) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W 1"]]:
+        """Render a view over black, without clamping, and its alpha."""
+        image, alphas = self._images(view, "RGB")
+        return image.cpu().numpy(), alphas.cpu().numpy()
+
     def depth(self, view: View) -> Float32[np.ndarray, "H W"]:
         """Render expected planar depth in world units; 0 where alpha is too low."""
         image, alphas = self._images(view, "ED")
