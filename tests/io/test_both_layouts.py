@@ -216,6 +216,49 @@ def test_a_layout_that_would_disturb_is_left_out(why, capture, seeded, tmp_path)
     assert any("depths" in note for note in texts(other)) == (why == "depth")
 
 
+@pytest.mark.parametrize("layout", ["auto", "transforms"])
+@pytest.mark.parametrize("named", ["PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "RADIAL"])
+def test_lens_models_have_the_names_that_trainers_know(named, layout, capture, tmp_path):
+    """Brush (crates/brush-dataset/src/formats/nerfstudio.rs) takes OPENCV and OPENCV_FISHEYE of
+    those that nerfstudio knows (CAMERA_MODEL_TO_TYPE), and PERSPECTIVE, which nerfstudio does not.
+    """
+    root = capture("opencv" if named == "RADIAL" else "pinhole")
+    path = root / "transforms.json"
+    content = json.loads(path.read_text())
+    distorted = named == "RADIAL"
+    if not distorted:
+        content = {
+            key: value for key, value in content.items() if key not in {"k1", "k2", "p1", "p2"}
+        }
+    path.write_text(json.dumps({**content, "camera_model": named}))
+    scene = load_scene(root)
+    out = write_scene(scene, tmp_path / "out", format=layout).path
+    meta = json.loads((out / "transforms.json").read_text())
+    terms = [meta.get(key) for key in ("k1", "k2", "p1", "p2")]
+    wanted = list(LENSES["opencv"].params[4:]) if distorted else [0, 0, 0, 0]
+    assert meta["camera_model"] == "OPENCV"
+    assert terms == wanted or named == "PERSPECTIVE"
+    assert load_scene(out).intrinsics == scene.intrinsics
+
+
+def test_a_frame_without_distortion_keeps_none(capture, tmp_path):
+    """Beside others that share one; and the others keep theirs."""
+    root = capture("opencv")
+    path = root / "transforms.json"
+    content = json.loads(path.read_text())
+    content["k3"] = 0.01
+    content["frames"][1]["camera_model"] = "PINHOLE"
+    path.write_text(json.dumps(content))
+    scene = load_scene(root)
+    out = write_scene(scene, tmp_path / "out").path
+    frame = json.loads((out / "transforms.json").read_text())["frames"][1]
+    assert frame["camera_model"] == "OPENCV"
+    assert [frame[key] for key in ("k1", "k2", "k3", "p1", "p2")] == [0, 0, 0, 0, 0]
+    again = load_scene(out)
+    assert [i.intrinsics for i in again.images] == [i.intrinsics for i in scene.images]
+    assert not again.images[1].intrinsics.has_distortion
+
+
 def test_fields_that_a_trainer_needs_are_added(capture, tmp_path):
     root = capture()
     path = root / "transforms.json"

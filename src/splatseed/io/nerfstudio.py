@@ -63,10 +63,10 @@ from splatseed.similarity import Similarity, fit_similarity, similarity_of
 from splatseed.text import counted
 
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
-_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _FISHEYE = "OPENCV_FISHEYE"
-_UNDISTORTED = ("PINHOLE", "SIMPLE_PINHOLE")
-_LENS_MODELS = frozenset({"camera_model", "is_fisheye"})
+UNDISTORTED = ("PINHOLE", "SIMPLE_PINHOLE")
+LENS_MODELS = frozenset({"camera_model", "is_fisheye"})
 """Keys of which either states the lens model."""
 _MAX_PIXELS = 1e9
 """Above all sizes and focal lengths, in pixels."""
@@ -299,10 +299,10 @@ def _merged(shared: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]
         replaced |= _FOCAL_LENGTHS["x"] | _FOCAL_LENGTHS["y"]  # square pixels, unless stated too
     if stated.keys() & _FOCAL_LENGTHS["y"]:
         replaced |= _FOCAL_LENGTHS["y"]
-    if stated.keys() & _LENS_MODELS:
-        model, other = _lens_model(stated), _lens_model(shared)
-        if model != other and (model in _UNDISTORTED or _FISHEYE in (model, other)):
-            replaced |= {*_LENS_MODELS, *_DISTORTION}
+    if stated.keys() & LENS_MODELS:
+        model, other = lens_model(stated), lens_model(shared)
+        if model != other and (model in UNDISTORTED or _FISHEYE in (model, other)):
+            replaced |= {*LENS_MODELS, *DISTORTION}
     kept = {key: value for key, value in shared.items() if key not in replaced}
     kept |= {key: kept[key] * by for key, by in resized.items() if _is_positive(kept.get(key))}
     return {**kept, **stated}
@@ -313,7 +313,7 @@ def _is_positive(value: object) -> bool:
     return number and 0 < value < _MAX_PIXELS  # type: ignore[operator]
 
 
-def _lens_model(values: Mapping[str, Any]) -> str:
+def lens_model(values: Mapping[str, Any]) -> str:
     """Return the name of a lens model; instant-ngp has a flag for fisheye lenses."""
     if values.get("is_fisheye") is True:
         return _FISHEYE
@@ -357,8 +357,8 @@ def _focal_length(
 
 def _lens(where: str, values: Mapping[str, Any]) -> tuple[str, tuple[float, ...]]:
     """Return COLMAP's model and distortion; COLMAP has no k4 for perspective lenses."""
-    model = _lens_model(values)
-    k1, k2, k3, k4, p1, p2 = (_number(where, values, key, 0.0) for key in _DISTORTION)
+    model = lens_model(values)
+    k1, k2, k3, k4, p1, p2 = (_number(where, values, key, 0.0) for key in DISTORTION)
     if model == _FISHEYE:
         return _FISHEYE, (k1, k2, k3, k4)
     if model not in _PERSPECTIVE:

@@ -215,9 +215,24 @@ def _kept_json(transforms: nerfstudio.Transforms, names: Collection[str]) -> dic
         lists[key] = [portable(name, files.photographs([name])) for name in kept_names]
     kept = {key: value for key, value in shared.items() if key != "test_frames"}
     tests = {"test_frames": frames[True]} if frames[True] else {}
-    if "camera_model" not in kept:
-        kept["camera_model"] = "OPENCV_FISHEYE" if content.get("is_fisheye") is True else "OPENCV"
+    _rename_models(kept, [*frames[False], *frames[True]])
     return {**kept, **lists, "frames": frames[False], **tests}
+
+
+def _rename_models(shared: dict[str, Any], frames: Sequence[dict[str, Any]]) -> None:
+    """Name lens models as nerfstudio writes them, since Brush knows no others.
+
+    A perspective lens is OPENCV, one without distortion has terms of 0: its own, and not those of
+    other frames. Frames keep theirs, which nerfstudio ignores beside shared ones.
+    """
+    stated = {*nerfstudio.DISTORTION, "distortion_params"}
+    for each in (shared, *(frame for frame in frames if frame.keys() & nerfstudio.LENS_MODELS)):
+        model = nerfstudio.lens_model(each)
+        own = each is shared and any(frame.keys() & stated for frame in frames)
+        if model in nerfstudio.UNDISTORTED and not own:
+            terms = {*_TERMS["OPENCV"], *(shared.keys() & {*nerfstudio.DISTORTION})}
+            each.update({term: each.get(term) or 0.0 for term in sorted(terms)})
+        each["camera_model"] = model if model in _TERMS else "OPENCV"
 
 
 def _named(transforms: nerfstudio.Transforms, key: str) -> list[str]:
