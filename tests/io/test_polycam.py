@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 
 import pytest
+from PIL import Image
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import find_depths, load_scene, write_scene
@@ -64,6 +65,40 @@ def test_key_frames_without_a_photograph_or_a_camera_are_left_out(export):
         f"1 of 8 photographs has no camera and is left out, such as {cameras[0].stem}.jpg.",
         "1 of 8 cameras has no photograph and is left out.",
     ]
+
+
+@pytest.mark.parametrize("originals", ["with sizes", "without", "none"])
+def test_corrected_cameras_without_a_size_have_the_photographs(
+    room_with_depth, tmp_path, originals
+):
+    """As the app exports since 2025 (nerfstudio's pull request 3725)."""
+    export = write_polycam(room_with_depth, tmp_path / "export")
+    for path in (export / "keyframes").glob("*cameras/*.json"):
+        if path.parent.name == "corrected_cameras" or originals == "without":
+            change(path, width=None, height=None)
+        elif originals == "none":
+            path.unlink()
+    scene = load(export)
+    assert scene.findings == ()
+    check_cameras(scene, room_with_depth)
+
+
+def test_intrinsics_without_a_size_are_those_of_the_export(export):
+    """Photographs that were resized since have another size than their cameras."""
+    for path in (export / "keyframes/corrected_cameras").iterdir():
+        change(path, width=None, height=None)
+    for path in (export / "keyframes/corrected_images").iterdir():
+        Image.open(path).resize((48, 36)).save(path)
+    scene = load(export)
+    assert [each.kind for each in scene.findings] == ["photographs-resized"]
+    assert (scene.images[0].camera.width, scene.images[0].intrinsics.width) == (48, 96)
+    shutil.rmtree(export / "keyframes/cameras")
+    with pytest.raises(SceneFormatError, match="a principal point near the middle of 48 x 36"):
+        load(export)
+    for path in (export / "keyframes/corrected_cameras").iterdir():
+        change(path, cx=24.0, cy=18.0, fx=500.0)
+    with pytest.raises(SceneFormatError, match="focal lengths of a phone"):
+        load(export)
 
 
 @pytest.mark.parametrize(

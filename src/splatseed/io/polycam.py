@@ -5,13 +5,16 @@ as ARKit has them; ``corrected_images`` (undistorted, black along the borders) a
 ``corrected_cameras`` (globally optimised) if the app could optimise; ``depth`` (planar z, 16-bit
 millimetres) and ``confidence`` (0, 127, 255 for low, medium, high). A camera has ``fx``, ``fy``,
 ``cx``, ``cy``, ``width``, ``height`` and ``t_00`` to ``t_23``, the rows of ``world_from_cam`` in
-OpenGL axes. Source: the README of Polycam's repository polyform. It does not say where pixels are
-counted from: the image corner is assumed, which may be half a pixel off.
+OpenGL axes. Since 2025, corrected cameras lack width and height: they have the photographs' size.
+Source: the README of Polycam's repository polyform; nerfstudio's pull request 3725. They do not say
+where pixels are counted from: the image corner is assumed, which may be half a pixel off.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +30,7 @@ from splatseed.io.phone import (
     read_record,
     without_photograph,
 )
+from splatseed.io.photograph_checks import photograph_size
 from splatseed.scene import Scene
 from splatseed.text import agreeing, counted, quoted
 
@@ -35,6 +39,7 @@ _CORRECTED = "corrected_"
 _ROWS = tuple(f"t_{row}{column}" for row in range(3) for column in range(4))
 _PINHOLE = ("fx", "fy", "cx", "cy")
 _SIZE = ("width", "height")
+_FOCAL = (0.2, 5.0)  # plausible focal lengths, in longer sides
 
 
 def is_polycam(folder: Path) -> bool:
@@ -78,7 +83,7 @@ def read_polycam(root: StrPath) -> Scene:
     findings += without_photograph(len(cameras) - len(used), len(cameras), "camera")
 
     def read(name: str) -> PhoneFrame:
-        return _read_camera(cameras[Path(name).stem])
+        return _read_camera(cameras[Path(name).stem], folder / name)
 
     track = cameras[Path(used[0]).stem]
     scene = read_phone_scene(root, track, folder, used, read, findings)
@@ -100,15 +105,35 @@ def _choose(keyframes: Path) -> tuple[str, list[str], dict[str, Path]]:
     return prefix, names, records
 
 
-def _read_camera(path: Path) -> PhoneFrame:
+def _read_camera(path: Path, photograph: Path) -> PhoneFrame:
     record = read_record(path, "a camera of Polycam")
     pose = np.array(read_numbers(f"{path}", record, _ROWS)).reshape(3, 4)
     fx, fy, cx, cy = read_numbers(f"{path}", record, _PINHOLE)
+    if all(record.get(side) is None for side in _SIZE):
+        # Photographs that were resized since do not have the principal point in the middle.
+        sizes = [photograph_size(photograph)]
+        original = path.parent.with_name("cameras") / path.name
+        found = read_record(original, "a camera of Polycam") if original.is_file() else {}
+        if found.keys() >= {*_SIZE}:
+            sizes.append(_size(original, found))
+        size = min(sizes, key=lambda each: max(abs(cx / each[0] - 0.5), abs(cy / each[1] - 0.5)))
+        if not _FOCAL[0] <= min(fx, fy) / max(size) <= max(fx, fy) / max(size) <= _FOCAL[1]:
+            raise SceneFormatError(
+                f"focal lengths of a phone in {path}, for {size[0]} x {size[1]} pixels",
+                found=f"fx {fx:g}, fy {fy:g}",
+                fix=EXPORT_AGAIN,
+            )
+    else:
+        size = _size(path, record)
+    return PhoneFrame(f"{path}", size, (fx, fy, cx, cy), pose)
+
+
+def _size(path: Path, record: Mapping[str, Any]) -> tuple[int, int]:
     width, height = read_numbers(f"{path}", record, _SIZE)
-    if not (width.is_integer() and height.is_integer()):
+    if not (width.is_integer() and height.is_integer() and min(width, height) > 0):
         raise SceneFormatError(
             f"width and height in pixels in {path}",
             found=f"{width:g} x {height:g}",
             fix=EXPORT_AGAIN,
         )
-    return PhoneFrame(f"{path}", (int(width), int(height)), (fx, fy, cx, cy), pose)
+    return int(width), int(height)
