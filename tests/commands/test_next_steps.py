@@ -12,7 +12,7 @@ import pytest
 
 from splatseed.camera import Intrinsics
 from splatseed.commands import next_steps
-from splatseed.commands.next_steps import print_training
+from splatseed.commands.next_steps import print_training, training_commands
 from splatseed.io import load_scene, write_scene
 from splatseed.pointcloud import PointCloud
 
@@ -145,5 +145,23 @@ def test_only_trainers_that_undistort_are_named_for_a_distorted_scene(bent, tmp_
     run = splatseed("upsample", bent, "--method", "mls", "-o", tmp_path / "out")
     after = run.out.partition("train it with\n")[2]
     named = [line.split()[0] for line in after.splitlines() if line.startswith("  ")]
-    assert named == ["gsplat", "nerfstudio", "Brush"]
+    assert named == ["gsplat", "nerfstudio", "Brush", "OpenSplat", "LichtFeld", "Spirula"]
+    assert "--undistort" in after.partition("LichtFeld")[2].partition("\n")[0]
     assert f"splatseed undistort {bent} -o {bent}_undistorted" in after
+
+
+@pytest.mark.parametrize(
+    ("model", "unable"),
+    [
+        ("OPENCV", set()),
+        ("SIMPLE_RADIAL", set()),
+        ("RADIAL", {"OpenSplat"}),  # its colmap.cpp throws
+        ("OPENCV_FISHEYE", {"OpenSplat"}),  # and its nerfstudio.cpp takes k1 as of a perspective
+    ],
+)
+def test_trainers_are_named_by_the_lenses_that_they_handle(model, unable):
+    every = dict(training_commands(Path("out"), "colmap"))
+    named = dict(training_commands(Path("out"), "colmap", frozenset({model})))
+    assert every.keys() - named.keys() == {"splatseed", "graphdeco", *unable}
+    assert "--undistort" in named["LichtFeld"]
+    assert "--undistort" not in every["LichtFeld"]

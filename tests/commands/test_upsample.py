@@ -131,7 +131,7 @@ def test_the_commands_to_train_with_name_what_is_there(seeded):
     lines = said.partition("train it with\n")[2].partition("note: ")[0].splitlines()
     commands = {line.split()[0]: shlex.split(line)[1:] for line in lines}
     assert next(iter(commands)) == "splatseed"
-    others = {"gsplat", "graphdeco", "nerfstudio", "Brush", "OpenSplat", "LichtFeld"}
+    others = {"gsplat", "graphdeco", "nerfstudio", "Brush", "OpenSplat", "LichtFeld", "Spirula"}
     assert set(commands) == {"splatseed", *others}
     for words in commands.values():
         assert str(out) in words  # one word, although it has a space

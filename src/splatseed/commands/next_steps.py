@@ -29,7 +29,7 @@ from splatseed.training.settings import BUDGET, TrainSettings
 from splatseed.training.traits import StrategyTraits
 
 TrainerName: TypeAlias = Literal[
-    "splatseed", "gsplat", "graphdeco", "nerfstudio", "brush", "opensplat", "lichtfeld"
+    "splatseed", "gsplat", "graphdeco", "nerfstudio", "brush", "opensplat", "lichtfeld", "spirula"
 ]
 RATIO = 16
 SMALL_SIDE, SMALL_STEPS = 480, 1500
@@ -38,10 +38,13 @@ COMPARE_SECONDS = 0.5
 """CPU seconds in which stereo compares a photograph (benchmarks/README.md, real size)."""
 COLMAP_ONLY = frozenset({"gsplat", "graphdeco", "LichtFeld"})
 """Trainers that read COLMAP's layout better than transforms.json."""
-PINHOLE_ONLY = frozenset({"splatseed", "graphdeco", "OpenSplat", "LichtFeld"})
-"""Trainers that do not handle lens distortion, as far as we know."""
 COMMON_LENSES = frozenset({"SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"})
-"""Camera models with distortion that the other trainers handle."""
+"""Camera models with distortion that trainers handle (docs/trainers.md), if not in ``LENSES``."""
+LENSES = {
+    "splatseed": frozenset[str](),
+    "graphdeco": frozenset[str](),
+    "OpenSplat": frozenset({"SIMPLE_RADIAL", "OPENCV"}),
+}
 CENTRED = 0.5
 """Offset of a principal point from the centre, in pixels, above which a note warns."""
 
@@ -117,13 +120,16 @@ def advice_commands(
         return [("seeds", _seeding(path, advice, planned, refine=refine))]
     first: Commands = []
     own = planned.trainer == "splatseed"
-    if is_distorted(scene) and (own or planned.trainer in map(str.lower, PINHOLE_ONLY)):
+    handled = {name.lower(): lenses for name, lenses in LENSES.items()}
+    lenses = distorted_lenses(scene)
+    if not lenses <= handled.get(planned.trainer, COMMON_LENSES):
         first, path = [("undistort", undistort_command(path))], undistorted_folder(path)
+        lenses = frozenset()
     source = quoted(path)
     plan = f"--budget {planned.budget} --max-steps {planned.max_steps}"
     refining = "--refine-poses " if refine else ""
     if not own:
-        return [*first, *_for_trainer(path, scene, advice, planned, refine=refine)]
+        return [*first, *_for_trainer(path, scene, advice, planned, lenses, refine=refine)]
     if advice.method == SEEDED:
         how = planned.flags
     elif advice.method == AS_IT_IS:
@@ -171,7 +177,13 @@ def _most_seeds(images: Sequence[Image]) -> int:
 
 
 def _for_trainer(
-    path: Path, scene: Scene, advice: Advice, planned: Planned, *, refine: bool
+    path: Path,
+    scene: Scene,
+    advice: Advice,
+    planned: Planned,
+    lenses: frozenset[str],
+    *,
+    refine: bool,
 ) -> Commands:
     source = scene.source.format
     layout: Layout = "transforms" if source == "transforms" else "colmap"
@@ -186,7 +198,7 @@ def _for_trainer(
         if other:
             layout, seeds = "colmap", f"{seeds} --format colmap"
         commands, path = [("seeds", seeds)], Path("OUT")
-    named = {name.lower(): command for name, command in training_commands(path, layout)}
+    named = {name.lower(): command for name, command in training_commands(path, layout, lenses)}
     return [*commands, ("train", named[planned.trainer])]
 
 
@@ -243,10 +255,10 @@ def print_training(read_from: Path, scene: Scene, output: Path, layout: Layout) 
     if missing := untrainable(scene):
         print_note(missing)
         return
-    lenses = {image.intrinsics.model for image in scene.images if image.intrinsics.has_distortion}
+    lenses = distorted_lenses(scene)
     known = lenses <= COMMON_LENSES
     if known:
-        trainers = training_commands(output, layout, distorted=bool(lenses))
+        trainers = training_commands(output, layout, lenses)
         print_pairs("train it with", trainers)
         if "graphdeco" in dict(trainers) and (off := off_centre(scene)) > CENTRED:
             text = (
@@ -262,6 +274,12 @@ def print_training(read_from: Path, scene: Scene, output: Path, layout: Layout) 
         print_note(Finding("lens-distortion", text, "info"))
 
 
+def distorted_lenses(scene: Scene) -> frozenset[str]:
+    """Return the camera models of a scene that have distortion."""
+    lenses = (image.intrinsics for image in scene.images)
+    return frozenset(lens.model for lens in lenses if lens.has_distortion)
+
+
 def off_centre(scene: Scene) -> float:
     """Return the largest distance of a principal point from its photograph's centre, in pixels."""
     sizes = np.array([(im.camera.width, im.camera.height) for im in scene.images])
@@ -269,8 +287,10 @@ def off_centre(scene: Scene) -> float:
     return float(np.linalg.norm(points - sizes / 2, axis=1).max(initial=0.0))
 
 
-def training_commands(path: Path, layout: Layout, *, distorted: bool = False) -> Commands:
+def training_commands(path: Path, layout: Layout, lenses: frozenset[str] = frozenset()) -> Commands:
     """Return (trainer, command) for every trainer that reads the scene at ``path`` unchanged.
+
+    ``lenses``: its camera models with distortion.
 
     Example:
         >>> dict(training_commands(Path("/data/out"), "colmap"))["graphdeco"]
@@ -279,10 +299,11 @@ def training_commands(path: Path, layout: Layout, *, distorted: bool = False) ->
     # Other trainers are run from their own checkouts, so a relative path would miss.
     full = path.resolve()
     scene = quoted(full)
-    result = [quoted(f"{full}-{name}") for name in ("gsplat", "graphdeco", "lichtfeld")]
+    result = [quoted(f"{full}-{name}") for name in ("gsplat", "graphdeco", "lichtfeld", "spirula")]
     gsplat = f"--data_dir {scene} --data_factor 1 --result_dir {result[0]}"
     alone = layout == "colmap"  # nerfstudio looks for transforms.json unless it is told otherwise
     folder = " colmap --colmap-path sparse/0 --downscale-factor 1" if alone else ""
+    undistort = " --undistort" if lenses else ""
     commands = {
         "splatseed": f"splatseed train {quoted(path)} -o {quoted(f'{path}-run')}",
         "gsplat": f"python examples/simple_trainer.py default {gsplat}",
@@ -290,8 +311,9 @@ def training_commands(path: Path, layout: Layout, *, distorted: bool = False) ->
         "nerfstudio": f"ns-train splatfacto --data {scene}{folder}",
         "Brush": f"brush {scene} --with-viewer",
         "OpenSplat": f"./opensplat {scene} -n 30000",
-        "LichtFeld": f"./build/LichtFeld-Studio -d {scene} -o {result[2]}",
+        "LichtFeld": f"./build/LichtFeld-Studio -d {scene} -o {result[2]}{undistort}",
+        "Spirula": f"spirula train --data {scene} --output-dir-prefix {result[3]}",
     }
-    unable = COLMAP_ONLY if layout == "transforms" else frozenset()
-    unable |= PINHOLE_ONLY if distorted else frozenset()
+    unable = {name for name, handled in LENSES.items() if not lenses <= handled}
+    unable |= COLMAP_ONLY if layout == "transforms" else frozenset()
     return [(name, command) for name, command in commands.items() if name not in unable]

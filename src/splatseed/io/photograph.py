@@ -205,6 +205,6 @@ def lens_findings(images: Sequence[Image]) -> list[Finding]:
     if not models:
         return []
     lenses = f"Cameras have lens distortion ({', '.join(models)})"
-    trainers = "splatseed train, graphdeco's trainer and OpenSplat need PINHOLE cameras"
+    trainers = "splatseed train and graphdeco's trainer need PINHOLE cameras"
     text = f"{lenses}; {trainers}: undistort the scene with splatseed undistort SCENE -o OUT."
     return [Finding("lens-distortion", text)]
