@@ -87,6 +87,54 @@ def test_an_orbit_circles_the_focus_of_the_cameras(run_folder):
     assert np.isfinite(apart).all()
 
 
+def _wall(at):
+    """Gaussians of a wall 8 wide, across x at this y."""
+    xz = np.stack(np.meshgrid(*2 * [np.linspace(-4, 4, 21)]), axis=-1).reshape(-1, 2)
+    means = np.insert(xz, 1, at, axis=1).astype(np.float32)
+    ones = np.ones((len(means), 1), np.float32)
+    return Gaussians(
+        means=means, scales=-2 * ones * np.float32([1, 1, 1]), opacities=4 * ones[:, 0],
+        quats=ones * np.float32([1, 0, 0, 0]), sh0=np.zeros((len(means), 1, 3), np.float32),
+        shN=np.zeros((len(means), 0, 3), np.float32),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("converging", [True, False])
+def test_an_orbit_stays_where_cameras_look_from(converging):
+    """A capture of a wall: cameras side by side that look at it, slightly down."""
+    views = []
+    for i, x in enumerate(np.linspace(-1, 1, 9)):
+        eye = np.array([x, -0.3 * (i % 2), 1.5])
+        target = np.array([0 if converging else x, 5, 0])
+        pose = look_at(eye, target, UP)
+        K = np.array([[100.0, 0, 60], [0, 100.0, 45], [0, 0, 1]])
+        views.append(View(f"{i:03}", NO_PIXELS, Camera(K, 120, 90, pose)))
+    notes = []
+    path = orbit(views, _wall(5.0), 40, (120, 90), note=notes.append)
+    assert [each.kind for each in notes] == ["orbit-swings"]
+    centers, known = _centers(path), _centers(views)
+    near = np.linalg.norm(centers[:, None] - known[None], axis=2).min(axis=1)
+    assert near.max() < 0.6
+    assert np.ptp(centers[:, 0]) > 1
+    # Both ends meet, so that the video can be repeated.
+    assert np.linalg.norm(centers[0] - centers[-1]) < 0.3
+    for view in path:
+        assert view.cam_from_world[2, 1] > 0.9  # it looks at the wall
+        # With a level horizon, of which parallel cameras that look down do not know the tilt.
+        assert abs(view.cam_from_world[0] @ [0, 0, 1, 0]) < (0.006 if converging else 0.03)
+    level = orbit(views, _wall(5.0), 4, (120, 90), up=np.array([0.0, 0.6, 0.8]))
+    assert all(abs(view.cam_from_world[0, :3] @ [0, 0.6, 0.8]) < 1e-9 for view in level)
+
+
+def test_an_orbit_of_two_sides_stays_on_the_larger():
+    ring = _ring(36)
+    path = orbit([*ring[:9], *ring[18:20]], _wall(0.0), 40, (120, 90))
+    angles = np.degrees(np.arctan2(*_centers(path)[:, 1::-1].T))
+    assert (angles.min() > -5, angles.max() < 85) == (True, True)
+    full = _centers(orbit(ring[::6], _wall(0.0), 40, (120, 90)))
+    assert np.ptp(np.arctan2(full[:, 1], full[:, 0])) > 6
+
+
 def _sideways(scene):
     """The scene as a phone stores it that was held upright: tall photographs, turned to be wide."""
     quarter = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])  # the top of an image becomes its left

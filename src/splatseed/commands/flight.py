@@ -95,6 +95,7 @@ class _Flight(NamedTuple):
     fps: float
     given: GivenCameras | None = None
     world: Similarity | None = None  # from the model's world to that of the given cameras
+    findings: tuple[Finding, ...] = ()
 
     @property
     def path(self) -> CameraPath | None:
@@ -158,8 +159,7 @@ def run(arguments: list[str]) -> None:
             videos.write_pictures(options.output, pictures(), names, overwrite=options.overwrite)
     _summarise(options, flight, clock.seconds().get("render", 0.0))
     print_note(*(finding for item in items for finding in item.findings))
-    if flight.given:
-        print_note(*flight.given.findings)
+    print_note(*flight.findings)
     if path is not None:
         size = views[0].width, views[0].height
         print_note(*path.findings(size, len(models[0]), len(items[0].model)))
@@ -225,6 +225,7 @@ def _asked_size(options: Options) -> tuple[int, int] | None:
 
 
 def _flight(options: Options, item: ViewerItem) -> _Flight:
+    from splatseed.photos.upright import vertical
     from splatseed.viewer import flights
     from splatseed.viewer.camera_path import read_camera_path
     from splatseed.viewer.cameras import GivenCameras, read_cameras
@@ -249,13 +250,17 @@ def _flight(options: Options, item: ViewerItem) -> _Flight:
     if options.file is None:
         frames = max(1, round((options.seconds or SECONDS) * FPS))
         if options.path == ORBIT or len(cameras) < 2:
-            return _Flight(flights.orbit(cameras, item.model, frames, size), FPS)
+            found = list[Finding]()
+            up = vertical(item.scene, [view.camera for view in cameras])
+            views = flights.orbit(cameras, item.model, frames, size, up=up, note=found.append)
+            return _Flight(views, FPS, findings=tuple(found))
         return _Flight(flights.smooth_path(cameras, frames, size), FPS)
     if options.is_video:
         given = replace(given, views=tuple(flights.at_size(view, size) for view in given.views))
     views, world = _in_models_world(options, item, given)
     fps = (given.path and given.path.fps) or FPS
-    return _Flight(views, len(views) / options.seconds if options.seconds else fps, given, world)
+    fps = len(views) / options.seconds if options.seconds else fps
+    return _Flight(views, fps, given, world, given.findings)
 
 
 def _in_models_world(

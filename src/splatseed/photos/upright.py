@@ -16,7 +16,7 @@ from jaxtyping import Float64
 
 from splatseed.camera import Camera
 from splatseed.io.photograph_checks import exif_orientation
-from splatseed.scene import Image
+from splatseed.scene import Image, Scene
 
 _EXIF_TURNS = {6: 1, 3: 2, 8: 3}
 """Clockwise quarter turns by EXIF's orientation; cameras do not mirror photographs."""
@@ -33,6 +33,8 @@ class UprightSettings:
     min_spread: float = 0.05  # of y; below, cameras look one way, and poses show no vertical
     looks_down: float = 0.17  # mean sine of the pitch above which cameras would look up
     min_up: float = 1e-6  # length of the mean up direction below which the cameras' cancel
+    # Of the mean up axis against horizontal x axes, which decide if these spread over 5 degrees.
+    up_weight: float = 0.005
 
 
 UPRIGHT = UprightSettings()
@@ -66,11 +68,27 @@ def turned(camera: Camera, quarters: int) -> Camera:
 
 
 def up_direction(cameras: Sequence[Camera]) -> Float64[np.ndarray, " 3"]:
-    """Mean up direction of upright cameras; without any, or if they cancel, -y, as in COLMAP."""
-    ups = [-camera.cam_from_world[1, :3] for camera in cameras] or [np.zeros(3)]
-    up = np.mean(ups, axis=0)
+    """Up direction of upright cameras; without any, or if they cancel, -y, as in COLMAP.
+
+    Upright cameras may look down, but their x axes are horizontal: of all directions near the mean
+    up axis, the one most nearly at right angles to them.
+    """
+    rotations = np.array([camera.cam_from_world[:3, :3] for camera in cameras]).reshape(-1, 3, 3)
+    right, up = rotations[:, 0], -rotations[:, 1].mean(axis=0) if len(cameras) else np.zeros(3)
     length = np.linalg.norm(up)
-    return np.asarray(up / length) if length > UPRIGHT.min_up else np.array([0.0, -1.0, 0.0])
+    if not length > UPRIGHT.min_up:
+        return np.array([0.0, -1.0, 0.0])
+    # min over u: mean (x_i . u)^2 + weight |u - up|^2
+    normal = right.T @ right / len(right) + UPRIGHT.up_weight * np.eye(3)
+    up = np.linalg.solve(normal, UPRIGHT.up_weight * up / length)
+    return np.asarray(up / np.linalg.norm(up))
+
+
+def vertical(scene: Scene | None, cameras: Sequence[Camera]) -> Float64[np.ndarray, " 3"]:
+    """Up direction of a scene: by gravity where a phone has recorded it, else by its cameras."""
+    if scene is not None and scene.source.format == "phone":
+        return np.array([0.0, 1.0, 0.0])
+    return up_direction(cameras)
 
 
 def _exif_turn(image: Image) -> int:

@@ -17,10 +17,14 @@ from scipy.ndimage import gaussian_filter1d
 
 from splatseed.camera import Camera
 from splatseed.errors import ParameterError
+from splatseed.findings import Finding
 from splatseed.photos.upright import up_direction
 from splatseed.photos.view import View
 from splatseed.photos.viewpoint import look_at
+from splatseed.photos.visibility import points_in_image
+from splatseed.progress import Note, silent_note
 from splatseed.projection import camera_centers, scaled
+from splatseed.sampling import evenly_spaced
 from splatseed.splat.gaussians import Gaussians
 from splatseed.text import counted, numeric_order
 from splatseed.viewer.models import CORE, pinhole_view
@@ -36,7 +40,20 @@ class _Smoothing:
     max_detour: float = 2.0  # length in order of names over that by nearest neighbours
 
 
-SMOOTHING = _Smoothing()
+@dataclasses.dataclass(frozen=True)
+class _Orbit:
+    max_gap: float = (
+        90.0  # degrees between neighbouring cameras around the focus; a larger one cuts
+    )
+    trimmed: float = 0.05  # share of the cameras at either end of an arc
+    min_swing: float = 3.0  # degrees to either side
+    one_way: float = 0.7  # length of the mean axis above which cameras look one way
+    near: float = 0.1  # quantile of the depths of Gaussians at which the scene begins
+    num_views: int = 20  # and Gaussians that are sampled for it
+    num_gaussians: int = 5000
+
+
+SMOOTHING, ORBIT = _Smoothing(), _Orbit()
 
 
 def smooth_path(views: Sequence[View], frames: int, size: tuple[int, int]) -> list[View]:
@@ -62,12 +79,22 @@ def smooth_path(views: Sequence[View], frames: int, size: tuple[int, int]) -> li
 
 
 def orbit(
-    views: Sequence[View], gaussians: Gaussians, frames: int, size: tuple[int, int]
+    views: Sequence[View],
+    gaussians: Gaussians,
+    frames: int,
+    size: tuple[int, int],
+    *,
+    up: Float64[np.ndarray, " 3"] | None = None,
+    note: Note = silent_note,
 ) -> list[View]:
-    """Circle the cameras' focus at their distance and height; without cameras, the model."""
+    """Circle the cameras' focus at their distance and height; without cameras, the model.
+
+    Where cameras look at it from some sides only, the path swings there and back, with a note.
+    ``up`` is by default that of the cameras.
+    """
     if len(views) > 1:
         centers = _poses(views)[:, :3]
-        focus, lens = focus_point(views), _lens(views, size)
+        focus, lens = _orbited(views, gaussians), _lens(views, size)
     else:
         focus = np.median(gaussians.means.astype(np.float64), axis=0)
         reach = np.quantile(np.linalg.norm(gaussians.means - focus, axis=1), CORE)
@@ -75,7 +102,8 @@ def orbit(
             reach = max(1.0, 3 * np.exp(gaussians.scales.astype(np.float64).max()))
         centers = (focus + reach * np.array([2.0, -0.7, 0.0]))[None]
         lens = _lens([pinhole_view(DEFAULT_SIZE, 2 * np.arctan(0.5), np.eye(4))], size)
-    up = up_direction([view.camera for view in views if len(views) > 1])
+    if up is None or len(views) < 2:
+        up = up_direction([view.camera for view in views if len(views) > 1])
     offsets = centers - focus
     # Distances from the focus along up, and around it.
     heights = offsets @ up
@@ -83,11 +111,49 @@ def orbit(
     first = np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0])
     first /= np.linalg.norm(first)
     side = np.cross(up, first)
+    angles = 2 * np.pi * np.arange(frames) / frames
+    arc = _arc(np.arctan2(offsets @ side, offsets @ first)) if len(views) > 1 else None
+    if arc is not None:
+        angles = arc[0] + arc[1] * np.sin(angles)
+        text = f"The cameras look at their focus from {np.degrees(2 * arc[1]):.0f} degrees around "
+        text += "it, so the orbit swings there and back."
+        note(Finding("orbit-swings", text, "info"))
     eyes = [
         focus + np.median(heights) * up + radius * (np.cos(angle) * first + np.sin(angle) * side)
-        for angle in 2 * np.pi * np.arange(frames) / frames
+        for angle in angles
     ]
     return _posed(lens, [(eye, focus, up) for eye in eyes])
+
+
+def _orbited(views: Sequence[View], gaussians: Gaussians) -> Float64[np.ndarray, " 3"]:
+    """Focus of the cameras; if these look one way and it is not in the scene, a point ahead."""
+    focus, (centers, axes, _) = focus_point(views), np.split(_poses(views), 3, axis=1)
+    forward = axes.mean(axis=0)
+    if np.linalg.norm(forward) < ORBIT.one_way:
+        return focus
+    xyz = gaussians.means[:: max(1, len(gaussians) // ORBIT.num_gaussians)].astype(np.float64)
+    sample = [views[i] for i in evenly_spaced(len(views), ORBIT.num_views)]
+    depths = np.concatenate([points_in_image(view.camera, xyz).depth for view in sample])
+    if not len(depths):
+        return focus
+    near, middle = np.quantile(depths, (ORBIT.near, 0.5))
+    if np.median(((focus - centers) * axes).sum(axis=1)) >= near:
+        return focus
+    return np.asarray(centers.mean(axis=0) + middle * forward / np.linalg.norm(forward))
+
+
+def _arc(azimuths: Float64[np.ndarray, " V"]) -> tuple[float, float] | None:
+    """Middle and half width of the directions from which cameras look; None if from all sides."""
+    ordered = np.sort(azimuths)
+    gaps = np.diff(ordered, append=ordered[0] + 2 * np.pi)
+    cuts = np.flatnonzero(gaps > np.radians(ORBIT.max_gap))
+    if not len(cuts):
+        return None
+    turned = np.roll(ordered, -cuts[0] - 1)
+    turned[len(ordered) - cuts[0] - 1 :] += 2 * np.pi
+    runs = np.split(turned, np.flatnonzero(np.diff(turned) > np.radians(ORBIT.max_gap)) + 1)
+    low, high = np.quantile(max(runs, key=len), (ORBIT.trimmed, 1 - ORBIT.trimmed))
+    return (low + high) / 2, max((high - low) / 2, np.radians(ORBIT.min_swing))
 
 
 def focus_point(views: Sequence[View]) -> Float64[np.ndarray, " 3"]:
@@ -130,7 +196,7 @@ def _poses(views: Sequence[View]) -> Float64[np.ndarray, "V 9"]:
 
 def _posed(lens: View, looks: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> list[View]:
     poses = [look_at(*look) for look in looks]
-    return [dataclasses.replace(lens.posed(p), name=f"{i}") for i, p in enumerate(poses)]
+    return [dataclasses.replace(lens.posed(p), name=f"{i:05}.png") for i, p in enumerate(poses)]
 
 
 def _resampled(
