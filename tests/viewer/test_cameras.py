@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -46,12 +47,13 @@ def test_graphdecos_cameras_have_their_size_and_name(room, tmp_path):
             read_cameras(tmp_path / "cameras.json")
 
 
-def test_distortion_is_said_to_be_left_out(tmp_path):
+def test_distortion_is_said_to_be_left_out(tmp_path, monkeypatch):
     """Cameras of photographs that do not exist yet, as one writes them to render."""
+    monkeypatch.chdir(tmp_path)
     lens = {"w": 64, "h": 48, "fl_x": 50, "fl_y": 51, "cx": 30, "cy": 25, "k1": 0.1}
     frame = {"file_path": "new/a.png", "transform_matrix": np.eye(4).tolist()}
     (tmp_path / "new.json").write_text(json.dumps({**lens, "frames": [frame]}))
-    given = read_cameras(tmp_path / "new.json")
+    given = read_cameras(Path("new.json"))
     assert [each.kind for each in given.findings] == ["ignored-distortion"]
     (view,) = given.views
     np.testing.assert_allclose(view.K, [[50, 0, 30], [0, 51, 25], [0, 0, 1]])

@@ -170,8 +170,9 @@ def add_offset(folder: Path, offset: Float64[np.ndarray, " 3"]) -> None:
 
 def offset_beside(path: Path) -> Float64[np.ndarray, " 3"] | None:
     """Read the offset of a folder or a file; None if not recorded."""
-    own = path.with_name(f"{path.name}.{RECENTER}")
-    places = (path / RECENTER,) if path.is_dir() else (own, path.parent / RECENTER)
+    places = [path / RECENTER]
+    if not path.is_dir():
+        places = [path.with_name(f"{path.name}.{RECENTER}"), path.parent / RECENTER]
     file = next((each for each in places if each.is_file()), None)
     if file is None:
         return None
