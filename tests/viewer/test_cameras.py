@@ -13,6 +13,7 @@ from PIL import Image
 from splatseed.errors import SceneFormatError
 from splatseed.io import load_scene
 from splatseed.photos.view import camera_views
+from splatseed.photos.visibility import points_in_image
 from splatseed.splat.formats import read_gaussians
 from splatseed.splat.rendering import ModelRenderer
 from splatseed.viewer.cameras import read_cameras
@@ -80,6 +81,29 @@ def test_flight_renders_given_cameras_by_name(room, run_folder, tmp_path, splats
     words = ("flight", run_folder, "--cameras", room, "-o", tmp_path / "renders")
     assert splatseed(*words).code == 2
     assert splatseed(*words, "--overwrite").code == 0
+
+
+def test_a_path_shows_its_crop_box_before_its_background(room, run_folder, tmp_path, splatseed):
+    camera = load_scene(room).images[3].camera
+    means = read_gaussians(run_folder / "point_cloud.ply").means
+    seen = points_in_image(camera, means).point_idx
+    middle = float(np.median(means[seen, 0]))
+    pose = np.linalg.inv(camera.cam_from_world) @ np.diag([1.0, -1, -1, 1])
+    fov = np.degrees(2 * np.arctan(camera.height / 2 / camera.K[1, 1]))
+    crop = {"crop_center": [middle - 50, 0, 0], "crop_scale": [100.0, 99, 99]}  # x below middle
+    crop |= {"crop_rot": [0.0, 0, 0], "crop_bg_color": {"r": 26, "g": 230, "b": 51}}
+    content = {
+        "camera_path": [{"camera_to_world": pose.ravel().tolist(), "fov": fov}] * 2,
+        "render_width": 95, "render_height": 71, "crop": crop,
+    }  # fmt: skip
+    (tmp_path / "path.json").write_text(json.dumps(content))
+    said = splatseed("flight", run_folder, "--path", tmp_path / "path.json", "-o", tmp_path / "a")
+    assert said.code == 0, said.err
+    assert f"of {len(means):,} Gaussians, those in its crop box" in said.out
+    picture = np.array(Image.open(tmp_path / "a/00001.png"))
+    assert picture.shape == (71, 95, 3)  # as asked for, though odd
+    empty = (picture == [26, 230, 51]).all(axis=2)
+    assert 0.01 < empty.mean() < 0.9
 
 
 def test_a_video_needs_cameras_of_one_size(room, run_folder, tmp_path, splatseed):
