@@ -119,6 +119,10 @@ class CameraPath:
         if self.crop is not None:
             text = f"{self.path} shows {inside:,} of {total:,} Gaussians, those in its crop box."
             found.append(Finding("cropped-path", text, "info"))
+        if self.size and max(abs(a - b) for a, b in zip(self.size, size, strict=True)) == 1:
+            text = f"Frames are {size[0]} x {size[1]}, not {self.size[0]} x {self.size[1]} as in "
+            text += f"{self.path}: H.264 needs even numbers."
+            found.append(Finding("path-not-followed", text, "info"))
         if other := [each for each in self.shapes if abs(each / shape - 1) > _SHAPE_SLACK]:
             are = agreeing(len(other), "is", "are")
             text = f"{counted(len(other), 'frame')} of {self.path} {are} made for a width of "
