@@ -26,7 +26,7 @@ VERBS = {
     "evaluate": "Score a trained model: PSNR, SSIM, FLIP, LPIPS.",
     "export": "Write a trained model as .ply, .spz, .sog or .splat; crop it.",
     "view": "Look at scenes and models in the browser.",
-    "flight": "Make a video of a path through a trained model, or pictures of cameras.",
+    "flight": "Make a video of a flight through a trained model, or pictures.",
     "bench": "Compare methods by training: many runs, resumable, then a report.",
     "depth": "Make depth maps of the photographs, by a network or by stereo.",
     "info": "Show what is in a scene or a model, and what is wrong with it.",
