@@ -39,10 +39,7 @@ _RGB_NAMES = (
     *((PACKED_RGB,), RGB, ("diffuse_red", "diffuse_green", "diffuse_blue")),
     *(("r", "g", "b"), _SH_NAMES),
 )
-_INTENSITY_NAMES = (
-    *("intensity", "scalar_intensity", "scalar_Intensity", "Intensity"),
-    *("reflectance", "scalar_Reflectance"),
-)
+_INTENSITY_NAMES = ("intensity", "reflectance", "reflectivity")
 _GREY = 128
 _WHITES = (255.0, 1023.0, 4095.0, 65535.0)
 """White of 8, 10, 12 and 16 bits."""
