@@ -1,9 +1,9 @@
 """Read point PLY files of any writer; write the layout that every 3DGS loader accepts.
 
-An *element* is a table; a *property* is a column of scalars or of lists (OpenMVS's dense clouds list
-the views of each vertex). Lists and other elements are skipped; elements before the vertices have
-no lists, as in practice. Names are read in lower case and without CloudCompare's ``scalar_``.
-Counts are checked against the file before memory is allocated.
+An *element* is a table; a *property* is a column of scalars or of lists (OpenMVS lists the views of
+each vertex). Lists and other elements are skipped; elements before the vertices have no lists, as
+in practice. Names are read in lower case and without CloudCompare's ``scalar_``. Counts are checked
+against the file before memory is allocated.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ _MODELS = {
 
 
 class Element(NamedTuple):
-    """A table: NumPy types of its columns by name; of lists, those of the values and the lengths."""
+    """A table: NumPy types of its columns by name, and those of the lengths of lists."""
 
     name: str
     num_rows: int
@@ -70,6 +70,9 @@ class Element(NamedTuple):
     def has_lists(self) -> bool:
         """Whether any column holds lists."""
         return bool(self.lengths)
+
+
+_NOTHING = Element("no element", 0, {})
 
 
 class Header(NamedTuple):
@@ -162,9 +165,6 @@ def open_ply(path: Path) -> CloudFile:
     if vertex.has_lists:
         return _ListLines(path, vertex, offset, integers)
     return LineCloud(path, list(vertex.types), offset, vertex.num_rows, types=integers)
-
-
-_NOTHING = Element("no element", 0, {})
 
 
 def _with_known_names(element: Element) -> Element:

@@ -208,9 +208,7 @@ def _white(header: Any, colors: Float64[np.ndarray, "N 3"]) -> float:
     return found
 
 
-def _pose(
-    header: Any, name: str
-) -> tuple[Float64[np.ndarray, " 4"], Float64[np.ndarray, " 3"]]:
+def _pose(header: Any, name: str) -> tuple[Float64[np.ndarray, " 4"], Float64[np.ndarray, " 3"]]:
     """Return the quaternion (wxyz, of any length) and the translation of a scan.
 
     Either may be missing; children are in any order.
@@ -275,15 +273,7 @@ def _read_scan(
             if name in arrays:
                 valid &= arrays[name][:number] == 0
         data = {name: array[:number][valid] for name, array in arrays.items()}
-        xyz = np.stack([data[name] for name in axes], axis=1)
-        if axes == _SPHERICAL:
-            distance, azimuth, elevation = xyz.T
-            flat, height = distance * np.cos(elevation), distance * np.sin(elevation)
-            xyz = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), height], axis=1)
-        quat, shift = pose
-        if quat.any():
-            xyz = xyz @ rotation_from_quat(quat).T
-        xyz = xyz + shift
+        xyz = _placed(np.stack([data[name] for name in axes], axis=1), axes == _SPHERICAL, pose)
         if _NO_COLOR in data:
             for name in _E57_COLORS.keys() & data.keys():
                 data[name][data[_NO_COLOR] != 0] = 0.0
@@ -292,3 +282,17 @@ def _read_scan(
     reader.close()
     if given < count:
         raise ValueError(f"{given:,} of {count:,} points of a scan")
+
+
+def _placed(
+    xyz: Float64[np.ndarray, "N 3"], is_spherical: bool, pose: tuple[np.ndarray, np.ndarray]
+) -> Float64[np.ndarray, "N 3"]:
+    """Return a scan's positions, possibly range, azimuth and elevation, in the file's frame."""
+    if is_spherical:
+        distance, azimuth, elevation = xyz.T
+        flat, height = distance * np.cos(elevation), distance * np.sin(elevation)
+        xyz = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), height], axis=1)
+    quat, shift = pose
+    if quat.any():
+        xyz = xyz @ rotation_from_quat(quat).T
+    return np.asarray(xyz + shift)
