@@ -83,10 +83,12 @@ class CloudFile(ABC):
         count: Rows by the header; None if unknown. ``chunks`` may yield fewer points, since rows
             marked invalid are skipped.
         findings: Problems of the file.
+        may_be_linear: Whether colours may be linear, as the format says, or sRGB, as many write.
         used: Names of the columns that are read: positions and colours.
     """
 
     findings: tuple[Finding, ...] = ()
+    may_be_linear = False
 
     def __init__(self, path: Path, names: Iterable[str], count: int | None = None) -> None:
         self.path, self.count = path, count

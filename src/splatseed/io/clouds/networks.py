@@ -4,10 +4,10 @@ NPZ: positions are the first array of ``POSITIONS`` found, of shape [..., 3]; co
 ``COLORS`` of the same size, with channels last or before rows and columns. ``MASKS`` select points;
 points whose ``CONFIDENCES`` are below ``MIN_CONFIDENCE`` are dropped. GLB (binary glTF): if any
 primitive is of points, only those are read, since exporters draw cameras as triangles beside them;
-otherwise the vertices of all meshes. Normalised integers are divided as glTF 2.0 says (3.11). Bytes
-of colours are taken as sRGB, as writers of points store them; wider ones are linear, as glTF says.
-(trimesh loads the whole file into memory, and turns vertices that it cannot decompress into zeros;
-here they are refused.)
+otherwise the vertices of all meshes. Normalised integers are divided as glTF 2.0 says (3.11). Its
+colours are linear, but exporters of points store those of photographs: ``may_be_linear``. (trimesh
+loads the whole file into memory, and turns vertices that it cannot decompress into zeros, as it
+does to sparse ones; here they are refused, and sparse ones read.)
 """
 
 from __future__ import annotations
@@ -168,6 +168,8 @@ class _Part(NamedTuple):
 
 class GlbCloud(CloudFile):
     """A .glb file."""
+
+    may_be_linear = True
 
     def __init__(self, path: Path) -> None:
         with translate_errors(path, _GLB), open_file(path) as file:

@@ -48,7 +48,7 @@ class _Memory:
     per_pixel: int = 8
     """For each pixel of the photographs: its colour, its grey level, and stereo's maps."""
     per_voxel: int = 320
-    """Upper bound: 45 in the table, the rest where voxels are checked, thinned and written."""
+    """Upper bound: 49 in the table, the rest where voxels are checked, thinned and written."""
     min_voxels: int = 1 << 16
     max_voxels: int = 1 << 24
 
