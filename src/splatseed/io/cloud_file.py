@@ -242,8 +242,24 @@ class Dialect:
         )
 
 
+def sample_lines(path: Path, offset: int, *, counts: bool = False) -> list[str]:
+    """Return lines spread over a file from ``offset`` on; ``counts`` as of ``LineCloud``."""
+    last = path.stat().st_size - SAMPLE_BYTES
+    places = {max(offset, offset + (last - offset) * i // (SAMPLES - 1)) for i in range(SAMPLES)}
+    lines: list[str] = []
+    with open_file(path) as file:
+        for place in sorted(places):
+            file.seek(place)
+            block = file.read(SAMPLE_BYTES).decode("latin-1").split("\n")
+            lines += _numbers(block[place > offset : -1] or block[:1], counts=counts)
+    return lines
+
+
 class LineCloud(CloudFile):
-    """Lines of numbers (XYZ, CSV, ascii PLY and PCD), read in blocks."""
+    """Lines of numbers (XYZ, CSV, ascii PLY and PCD), read in blocks.
+
+    With ``counts``, lines of one number are not points but numbers of points, as PTS files have.
+    """
 
     def __init__(
         self,
@@ -254,8 +270,10 @@ class LineCloud(CloudFile):
         *,
         dialect: Dialect | None = None,
         types: Mapping[str, np.dtype[Any]] | None = None,
+        counts: bool = False,
     ) -> None:
         super().__init__(path, names, count)
+        self._counts = counts
         self._places = [names.index(name) for name in self.used]
         self._offset, self._dialect, self._types = offset, dialect or Dialect(), types or {}
 
@@ -272,14 +290,7 @@ class LineCloud(CloudFile):
             )
 
     def _sample(self) -> Block:
-        first, last = self._offset, self.path.stat().st_size - SAMPLE_BYTES
-        places = {max(first, first + (last - first) * i // (SAMPLES - 1)) for i in range(SAMPLES)}
-        lines: list[str] = []
-        with open_file(self.path) as file:
-            for place in sorted(places):
-                file.seek(place)
-                block = file.read(SAMPLE_BYTES).decode("latin-1").split("\n")
-                lines += _numbers(block[place > first : -1] or block[:1])
+        lines = sample_lines(self.path, self._offset, counts=self._counts)
         return self._block(lines[: self.count], 0)
 
     def _block(self, lines: Sequence[str], num_before: int) -> Block:
@@ -321,10 +332,11 @@ class LineCloud(CloudFile):
             while data := file.read(_TEXT_BYTES):
                 whole, end, rest = (rest + data).rpartition(b"\n")
                 if end:
-                    yield _numbers(whole.decode("latin-1").split("\n"))
-        yield _numbers([rest.decode("latin-1")])
+                    yield _numbers(whole.decode("latin-1").split("\n"), counts=self._counts)
+        yield _numbers([rest.decode("latin-1")], counts=self._counts)
 
 
-def _numbers(lines: Sequence[str]) -> list[str]:
-    """Drop empty lines and comments."""
-    return [s for line in lines if (s := line.strip()) and s[0] != "#"]
+def _numbers(lines: Sequence[str], *, counts: bool) -> list[str]:
+    """Drop empty lines, comments and, with ``counts``, numbers of points."""
+    kept = [s for line in lines if (s := line.strip()) and s[0] not in "#/"]
+    return [line for line in kept if not line.isdecimal()] if counts else kept

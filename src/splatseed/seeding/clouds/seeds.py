@@ -64,8 +64,9 @@ def cloud_seeds(
     """Make seeds from files, for a scene with cameras."""
     frames = frames_of(scene)
     merged = read_clouds(
-        inputs.paths, inputs.scene_from_cloud, frames, settings.pixels, inputs.capacity, progress
-    )
+        inputs.paths, inputs.scene_from_cloud, frames, settings.pixels, inputs.capacity, progress,
+        settings.columns,
+    )  # fmt: skip
     voxels, images, views = merged.voxels, scene.images, frames
     if not len(voxels) or _is_elsewhere(merged, scene):
         raise _out_of_view(merged, scene)
@@ -90,9 +91,9 @@ def cloud_seeds(
         findings.append(Finding("colors-of-photographs", text, "info"))
     elif scene.has_photographs and (number := int(selected.uncolored.sum())):
         text = (
-            f"Of {number:,} of {len(xyz):,} seeds the cloud has no colour (black, or the same for"
+            f"{number:,} of {len(xyz):,} seeds have no colour in the cloud (black, or one colour "
         )
-        text += " many and not the photographs'): theirs is from the photographs."
+        text += "that the photographs contradict): theirs is from the photographs."
         findings.append(Finding("colors-of-photographs", text, "info"))
     if share < LOW_COVERAGE:
         hint = ": `method='auto'` with `cloud` seeds the rest" if inputs.alone else ""
