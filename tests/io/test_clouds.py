@@ -296,6 +296,8 @@ def test_text_as_programs_write_it(tmp_path, points):
         "ends.csv": [row + "," for row in commas],
         "named.csv": ["\ufeffx [m],y [m],z [m],R,G,B,", *(row + "," for row in commas)],
         "marked.txt": ["\ufeff" + plain[0], *plain[1:]],
+        "labelled.csv": ["Name,X,Y,Z,R,G,B", *(f"wall {i},{row}" for i, row in enumerate(commas))],
+        "quoted.csv": ["x,y,z,r,g,b", *('"' + row.replace(",", '","') + '"' for row in commas)],
         "numbered.txt": [f"{i + 5}\t{row}" for i, row in enumerate(plain)],
         "a.xyzrgb": [row.replace(" -900", "") for row in rows],
     }

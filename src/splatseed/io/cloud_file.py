@@ -237,9 +237,11 @@ class Dialect:
         """Parse the columns ``places`` of each line; raise ``ValueError`` if one is no number."""
         if self.decimal_comma:
             lines = [line.replace(",", ".") for line in lines]
+        quote = '"' if lines and '"' in lines[0] else None
         return np.loadtxt(
-            lines, np.float64, comments=None, delimiter=self.delimiter, usecols=places, ndmin=2
-        )
+            lines, np.float64, comments=None, delimiter=self.delimiter, usecols=places, ndmin=2,
+            quotechar=quote,
+        )  # fmt: skip
 
 
 def sample_lines(path: Path, offset: int, *, counts: bool = False) -> list[str]:

@@ -133,14 +133,14 @@ class _Table(NamedTuple):
     """
 
     rows: RowCloud | None
-    count: int
+    num_rows: int
     item: np.dtype[Any]
     full: float  # what normalised integers are divided by; 1 without
     changed: tuple[np.ndarray, np.ndarray]
 
     def raw(self, start: int, size: int) -> np.ndarray:
         """Read rows from ``start``, at most ``size``, as they are stored."""
-        number = min(size, self.count - start)
+        number = min(size, self.num_rows - start)
         zero = np.zeros((number, *self.item.shape), self.item.base)
         values = zero if self.rows is None else self.rows.rows(start, size)["values"]
         at, new = self.changed
@@ -184,7 +184,7 @@ class GlbCloud(CloudFile):
             if not self._parts:
                 raise ValueError("no vertices")
         colored = all(part.color for part in self._parts)
-        count = sum(part.position.count for part in self._parts)
+        count = sum(part.position.num_rows for part in self._parts)
         super().__init__(path, (*XYZ, *RGB) if colored else XYZ, count)
         if points and len(points) < len(parts):
             text = "It holds points and meshes: the meshes are left out."
@@ -196,7 +196,7 @@ class GlbCloud(CloudFile):
     def _blocks(self, size: int) -> Iterator[Block]:
         with translate_errors(self.path, _GLB):
             for part in self._parts:
-                for start in range(0, part.position.count, size):
+                for start in range(0, part.position.num_rows, size):
                     with np.errstate(invalid="ignore", over="ignore"):
                         xyz = part.position.read(start, size)
                         xyz = xyz @ part.matrix[:3, :3].T + part.matrix[:3, 3]
@@ -219,7 +219,7 @@ def _primitives(path: Path, content: Mapping[str, Any], body: int) -> Iterator[_
                 if name in {"POSITION", "COLOR_0"}
             }
             mode, color = int(primitive.get("mode", _TRIANGLES)), tables.get("COLOR_0")
-            if color and color.count != tables["POSITION"].count:
+            if color and color.num_rows != tables["POSITION"].num_rows:
                 raise ValueError("not one colour per vertex")
             yield _Part(mode, matrix, tables["POSITION"], color)
 

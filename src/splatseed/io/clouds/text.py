@@ -37,7 +37,8 @@ _COMMENT = re.compile(r"^(//|#|%|;)+\s*")
 _BRACKETS = re.compile(r"[\[(].*?[\])]")
 _MARK = "\ufeff".encode().decode("latin-1")
 """The byte order mark of UTF-8, which Windows programs write."""
-_SKIPPED = "_"
+_SKIPPED, _NEAR = "_", 5
+"""Name of a column that is not read; lines before the first row, one of which may name columns."""
 _COLUMNS = (*XYZ, "red", "green", "blue", "intensity", "nx", "ny", "nz")
 
 
@@ -48,13 +49,19 @@ def open_text(path: Path, columns: str | Sequence[str] = ()) -> CloudFile:
     lines = head.split("\n")[: None if len(head) < SAMPLE_BYTES else -1]
     marked = lines[0].startswith(_MARK)
     lines[0] = lines[0].removeprefix(_MARK)
-    first, dialect = _first_line(path, lines)
+    given = _given(columns)
+    first, dialect = _first_line(path, lines, given)
     # Of latin-1, a byte is a character.
     offset = marked * len(_MARK) + sum(len(line) + 1 for line in lines[:first])
     is_pts = path.suffix.lower() == ".pts"
     num = len(_fields(lines[first], dialect))
-    given = _given(path, columns, num)
-    named = given or _named(lines[:first], dialect, num)
+    if given and len(given) != num:
+        raise ParameterError(
+            f"`cloud.columns` to name the {num} columns of {path}",
+            found=f"{len(given)}",
+            fix=f"Name all columns; {_SKIPPED} skips one.",
+        )
+    named = given or _named(lines[max(first - _NEAR, 0) : first], dialect, num)
     names = named or _guessed(path, offset, dialect, num, is_pts=is_pts)
     cloud = LineCloud(path, names, offset, dialect=dialect, counts=is_pts)
     if named is None:
@@ -65,12 +72,12 @@ def open_text(path: Path, columns: str | Sequence[str] = ()) -> CloudFile:
         elif cloud.colors == "intensity":
             colors = f"{names.index('intensity') + 1} as intensity"
         guess = f"columns {place} to {place + 2} of {path.name} are taken as x, y, z, {colors}"
-        text = f"It has no header line: {guess}."
+        text = f"No header line names columns: {guess}."
         cloud.findings = (Finding("guessed-columns", text, fix=_fix(names)),)
     return cloud
 
 
-def _given(path: Path, columns: str | Sequence[str], count: int) -> list[str] | None:
+def _given(columns: str | Sequence[str]) -> list[str] | None:
     """Return the full names of columns that the caller named; None without."""
     text = columns if isinstance(columns, str) else " ".join(columns)
     words = [word for word in re.split(r"[\s,]+", text.lower()) if word]
@@ -85,12 +92,6 @@ def _given(path: Path, columns: str | Sequence[str], count: int) -> list[str] | 
             f"{_SKIPPED} to skip a column",
             found=" ".join(words),
             fix="Name the columns in their order, such as `cloud.columns='x y z i r g b'`.",
-        )
-    if len(words) != count:
-        raise ParameterError(
-            f"`cloud.columns` to name the {count} columns of {path}",
-            found=f"{len(words)}: {' '.join(words)}",
-            fix=f"Name all columns; {_SKIPPED} skips one.",
         )
     return known
 
@@ -127,18 +128,30 @@ def _columns(names: Sequence[str]) -> str:
     return f"`cloud.columns={' '.join(words)!r}`"
 
 
-def _first_line(path: Path, lines: Sequence[str]) -> tuple[int, Dialect]:
-    """Find the first line of three or more numbers, and its dialect."""
+def _first_line(
+    path: Path, lines: Sequence[str], given: Sequence[str] | None
+) -> tuple[int, Dialect]:
+    """Find the first line of three or more numbers, and its dialect.
+
+    Where columns are named, other fields than x, y, z may be text, such as a point's name.
+    """
     for i, line in enumerate(lines):
         for dialect in _dialects(line):
+            fields = _fields(line, dialect)
+            names = given or _named(lines[max(i - _NEAR, 0) : i], dialect, len(fields))
+            if names and len(names) == len(fields):
+                fields = [fields[names.index(axis)] for axis in XYZ]
             with suppress(ValueError):
-                if len([float(field) for field in _fields(line, dialect)]) >= 3:
+                if len([float(field) for field in fields]) >= 3:
                     return i, dialect
     found = next((repr(line.strip()[:60]) for line in lines if line.strip()), "an empty file")
+    if any("\0" in line for line in lines):
+        found = "text in UTF-16, or no text: save it as UTF-8"
     raise SceneFormatError(
         f"{path} to have one point per line, x y z first or below a header line",
         found=found,
-        fix="Export the cloud as text with x, y, z, or in another format.",
+        fix="Name its columns, such as `cloud.columns='_ x y z r g b'` where the first is text, or "
+        "export the cloud in another format.",
     )
 
 
