@@ -5,7 +5,7 @@ import pytest
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
-from splatseed.io.ply import read_ply, write_ply
+from splatseed.io.ply import open_ply, read_ply, write_ply
 
 KINDS = {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort", "i4": "int"}
 ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
@@ -129,9 +129,12 @@ def _with_lists(tmp_path, form, rng, before=""):
     "before", ["", "element camera 4\nproperty uchar id\nproperty double focal\n"]
 )
 def test_lists_among_properties_and_elements_before_vertices_are_skipped(
-    tmp_path, form, before, rng
+    tmp_path, form, before, rng, monkeypatch
 ):
     path, xyz, rgb = _with_lists(tmp_path, form, rng, before)
+    monkeypatch.setattr("splatseed.io.ply._READ_BYTES", 100)
+    chunks = list(open_ply(path).chunks(7))
+    np.testing.assert_array_equal(np.concatenate([chunk.xyz for chunk in chunks]), xyz)
     points = read_ply(path)
     np.testing.assert_array_equal(points.xyz, xyz)
     np.testing.assert_array_equal(points.rgb, rgb)

@@ -6,7 +6,13 @@ from splatseed.runtime.jit import inline
 
 
 @inline
-def find_rows(data, at, runs, is_big, starts):  # uint8 [B], int, int64 [K, 3], bool, int64 [R, K]
+def find_rows(
+    data: np.ndarray,  # uint8 [B]
+    at: int,
+    runs: np.ndarray,  # int64 [K, 3]
+    is_big: bool,
+    starts: np.ndarray,  # int64 [R, K]
+) -> tuple[int, int]:
     """Fill where each run of scalars starts, in up to R rows from ``at`` on.
 
     ``runs`` has the bytes of each run, of the length of the list after it (0: none), and of a value

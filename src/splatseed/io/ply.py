@@ -222,20 +222,22 @@ class _ListCloud(CloudFile):
     def _blocks(self, size: int) -> Iterator[Block]:
         from splatseed.io._kernels import find_rows  # noqa: PLC0415  (Numba)
 
-        data, at, given = np.empty(0, np.uint8), 0, 0
+        data, end, given = np.empty(0, np.uint8), 0, 0
         with open_file(self.path) as file:
             file.seek(self._offset)
             while given < self._num_rows:
+                data = data[end:]
                 starts = np.empty((min(size, self._num_rows - given), len(self._runs)), np.int64)
-                num, end = find_rows(data, at, self._runs, self._is_big, starts)
-                if num:
-                    yield {name: self._column(name, data, starts[:num]) for name in self.used}
-                given, at = given + num, end
-                if num < len(starts):
-                    more = np.frombuffer(file.read(_READ_BYTES), np.uint8)
-                    if not len(more):
+                num, end = find_rows(data, 0, self._runs, self._is_big, starts)
+                while num < len(starts):
+                    more = file.read(max(_READ_BYTES, len(data)))
+                    if not more:
                         check_min_size(self.path, file.tell() + 1)  # raises: a row is cut
-                    data, at = np.concatenate([data[at:], more]), 0
+                    data = np.concatenate([data, np.frombuffer(more, np.uint8)])
+                    added, end = find_rows(data, end, self._runs, self._is_big, starts[num:])
+                    num += added
+                yield {name: self._column(name, data, starts) for name in self.used}
+                given += num
 
     def _column(self, name: str, data: np.ndarray, starts: np.ndarray) -> np.ndarray:
         run, place, dtype = self._columns[name]

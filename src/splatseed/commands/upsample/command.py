@@ -65,9 +65,9 @@ def run(arguments: list[str]) -> None:
     check_output(options.output, kind="upsample", overwrite=options.overwrite, protect=protect)
     if options.gaussians is not None:
         check_free(options.gaussians, overwrite=options.overwrite, protect=protect)
+    clouds: Any = methods[CLOUD]
     for file in options.cloud_files:
-        # Reads the header, so that a bad file fails before work starts.
-        open_cloud(file, methods[CLOUD].columns)
+        open_cloud(file, clouds.columns)  # reads the header, so that a bad file fails first
     _upsample(options, methods, arguments)
 
 
