@@ -177,7 +177,10 @@ class GlbCloud(CloudFile):
             if (magic, version, kind) != _GLTF or length > path.stat().st_size:
                 raise ValueError("no binary glTF of version 2")
             content = json.loads(file.read(length))
-            _check_extensions(path, content.get("extensionsRequired", []))
+            nodes = [
+                name for node in content.get("nodes", []) for name in node.get("extensions", {})
+            ]
+            _check_extensions(path, [*content.get("extensionsRequired", []), *nodes])
             parts = list(_primitives(path, content, file.tell() + 8))
             points = [part for part in parts if part.mode == _POINTS]
             self._parts = points or parts
@@ -302,7 +305,12 @@ def _rows(
     """Return the rows of a part of the body, which may be interleaved with others."""
     view = content["bufferViews"][where["bufferView"]]
     if view.get("buffer", 0) != 0 or "uri" in content["buffers"][0]:
-        raise ValueError("vertices in another file")
+        _check_extensions(path, view.get("extensions", {}))
+        raise SceneFormatError(
+            f"{path} to hold its vertices",
+            found="them in another file",
+            fix="Save it as one .glb, for instance in Blender.",
+        )
     stride, at = int(view.get("byteStride", 0)) or item.itemsize, int(where.get("byteOffset", 0))
     within = at % stride if stride > item.itemsize else 0
     layout: Any = {"names": ["values"], "formats": [item], "offsets": [within], "itemsize": stride}
