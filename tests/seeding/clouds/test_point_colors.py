@@ -60,8 +60,8 @@ def test_many_black_points_among_others_take_the_photographs_colours(room):
 
 
 def test_linear_colours_are_encoded_where_the_photographs_say_so():
-    """IEC 61966-2-1: 0.2140 of white is encoded as 0.5, 0.0033 as 0.04."""
-    linear, seen = np.uint8([[55, 1, 255]] * 20), np.uint8([[128, 13, 255]] * 20)
+    """IEC 61966-2-1: 0.216 of white is encoded as 0.502, 0.055 as 0.260."""
+    linear, seen = np.uint8([[55, 14, 255]] * 20), np.uint8([[128, 66, 255]] * 20)
     encoded = encoded_if_linear(linear, seen, np.arange(20))
-    assert encoded[0].tolist() == [128, 13, 255]
+    assert encoded[0].tolist() == [128, 66, 255]
     assert encoded_if_linear(seen, seen, np.arange(20)) is None

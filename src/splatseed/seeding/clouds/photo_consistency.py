@@ -71,7 +71,9 @@ class ConsistencySettings:
     min_filling: float = 0.05
     """Fraction of the voxels that have one colour, from which on it may stand for none ..."""
     filling_difference: int = 16
-    """... if the photographs' differ by more grey levels beyond ``color_factor``."""
+    """... if the photographs' differ by more grey levels, beyond ..."""
+    filling_factor: float = 2.0
+    """... this factor of the median difference of the others."""
     min_support: float = 0.05
     repeat_above: float = 0.002
     """Fraction of dropped voxels above which the others are checked again."""
@@ -311,32 +313,25 @@ def _uncolored(
     uncolored = ~has_color
     for filling in codes[counts >= CONSISTENCY.min_filling * len(colors)]:
         filled = has_color & (code == filling)
-        difference, limit = _compare_colors(
-            evidence, colors, has_color & ~filled, CONSISTENCY.filling_difference
-        )
+        difference, typical = _compare_colors(evidence, colors, has_color & ~filled)
         known = difference[filled & ~np.isnan(difference)]
+        limit = CONSISTENCY.filling_difference + CONSISTENCY.filling_factor * typical
         if len(known) and np.median(known) > limit:
             uncolored |= filled
     return uncolored
 
 
 def _compare_colors(
-    evidence: Evidence,
-    colors: UInt8[np.ndarray, "N 3"],
-    known: Bool[np.ndarray, " N"],
-    beyond: float = CONSISTENCY.color_difference,
+    evidence: Evidence, colors: UInt8[np.ndarray, "N 3"], known: Bool[np.ndarray, " N"]
 ) -> tuple[Float64[np.ndarray, " N"], float]:
-    """Return how far colours are from the photographs', NaN if unknown, and how far they may be.
+    """Return how far colours are from the photographs', and the median of the ``known`` ones.
 
-    The limit is that many grey levels beyond what is typical of those ``known`` to be the cloud's.
+    NaN where photographs do not tell; the median is infinite if they do nowhere.
     """
     difference = np.abs(colors.astype(np.int16) - evidence.rgb).max(axis=1).astype(np.float64)
     difference[np.isnan(evidence.agreement)] = np.nan
     typical = difference[known & ~np.isnan(difference)]
-    if not len(typical):
-        return difference, np.inf
-    limit = beyond + CONSISTENCY.color_factor * np.median(typical)
-    return difference, float(limit)
+    return difference, float(np.median(typical)) if len(typical) else np.inf
 
 
 def _contradicted(
@@ -353,8 +348,8 @@ def _contradicted(
     inconsistent &= evidence.confirmations < s.min_confirmations
     other_color = np.zeros_like(violation)
     if colors is not None:
-        difference, limit = _compare_colors(evidence, colors, colored)
-        other_color = colored & (difference > limit)
+        difference, typical = _compare_colors(evidence, colors, colored)
+        other_color = colored & (difference > s.color_difference + s.color_factor * typical)
     contradicted = np.zeros_like(violation)
     counts = {}
     reasons = {
