@@ -82,16 +82,16 @@ def test_other_columns():
 
 
 def test_columns_as_the_caller_names_them(tmp_path):
-    rgb, path = NATURAL.astype(int), tmp_path / "a.xyz"
-    noisy = levels(NATURAL.mean(axis=1) + RNG.normal(0, 10, NUM))
-    np.savetxt(path, np.column_stack([noisy, XYZ, rgb]), "%.6g")
-    np.savetxt(tmp_path / "b.xyz", np.column_stack([XYZ, noisy, rgb]), "%.6g")
+    xyz, rgb, path = XYZ[:400], NATURAL[:400].astype(int), tmp_path / "a.xyz"
+    noisy = levels(rgb.mean(axis=1) + RNG.normal(0, 10, 400))
+    np.savetxt(path, np.column_stack([noisy, xyz, rgb]), "%.6g")
+    np.savetxt(tmp_path / "b.xyz", np.column_stack([xyz, noisy, rgb]), "%.6g")
     with pytest.raises(SceneFormatError, match=r"4 to 6 or 5 to 7.*'x y z _ r g b'"):
         open_cloud(tmp_path / "b.xyz")
     for columns in ("_ x y z r g b", ("i", "X", "Y", "Z", "red", "green", "blue")):
         cloud = open_cloud(path, columns)
         chunk = next(cloud.chunks())
-        np.testing.assert_allclose(chunk.xyz, XYZ, atol=1e-4)
+        np.testing.assert_allclose(chunk.xyz, xyz, atol=1e-4)
         np.testing.assert_array_equal(chunk.rgb, rgb)
         assert not cloud.findings
     swapped = next(open_cloud(path, "_ x y z b g r").chunks())

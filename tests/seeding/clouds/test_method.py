@@ -91,7 +91,7 @@ def test_points_that_the_scan_left_black_or_filled_take_the_photographs_colours(
     right = new_points(seeds[0])
     left = scan[0][:, 0] > 0
     random = np.random.default_rng(0).random(len(left)) < 0.5
-    for which, filling in ((random, 0), (left, 0), (left, 128)):
+    for which, filling in ((random, 0), (left, 128)):
         rgb = np.where(which[:, None], filling, scan[1]).astype(np.uint8)
         notes = []
         new = new_points(
