@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import struct
+
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
@@ -77,6 +80,56 @@ def test_e57_scans_stand_where_their_poses_say(tmp_path, points):
     check(path, np.concatenate([xyz, turned]), np.concatenate([rgb, rgb]), 1e-5)
 
 
+@pytest.mark.parametrize(("turn", "found"), [((0, 0, 0, 0), True), ((-3, 0, 0, 0), False)])
+def test_e57_quaternions_of_any_length_and_zero_for_no_rotation(tmp_path, points, turn, found):
+    pye57 = pytest.importorskip("pye57")
+    fields = {f"cartesian{axis}": points[0][:, i].copy() for i, axis in enumerate("XYZ")}
+    file = pye57.E57(str(tmp_path / "scan.e57"), mode="w")
+    file.write_scan_raw(fields, rotation=np.array(turn, float), translation=np.array([0, 0, 5.0]))
+    file.close()
+    check(tmp_path / "scan.e57", points[0] + (0, 0, 5), None, 1e-5)
+    findings = open_cloud(tmp_path / "scan.e57").findings
+    assert [each.kind for each in findings] == ["zero-rotation"] * found
+
+
+def test_e57_by_angles_with_limits_and_invalid_colours(tmp_path):
+    """Written node by node: pye57 writes neither. Colours are dark: 16 bits only by their limit."""
+    libe57 = pytest.importorskip("pye57").libe57
+    path = str(tmp_path / "scan.e57")
+    image = libe57.ImageFile(path, "w")
+    scan, limits = libe57.StructureNode(image), libe57.StructureNode(image)
+    for name in ("Red", "Green", "Blue"):
+        limits.set(f"color{name}Maximum", libe57.IntegerNode(image, 65535))
+    pose, shift = libe57.StructureNode(image), libe57.StructureNode(image)
+    for axis, value in zip("zyx", (3.0, 2.0, 1.0), strict=True):  # in any order
+        shift.set(axis, libe57.FloatNode(image, value))
+    pose.set("translation", shift)
+    kinds = {f"spherical{name}": "d" for name in ("Range", "Azimuth", "Elevation")}
+    kinds |= {f"color{name}": "H" for name in ("Red", "Green", "Blue")} | {"isColorInvalid": "b"}
+    prototype = libe57.StructureNode(image)
+    for name, kind in kinds.items():
+        node = libe57.FloatNode(image) if kind == "d" else libe57.IntegerNode(image, 0, 0, 65535)
+        prototype.set(name, node)
+    points = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
+    for name, node in (("colorLimits", limits), ("pose", pose), ("points", points)):
+        scan.set(name, node)
+    scans = libe57.VectorNode(image, True)
+    image.root().set("data3D", scans)
+    scans.append(scan)
+    angle = np.pi / 2
+    values = [(2, 2, 2), (0, angle, 0), (0, 0, angle), *[(514, 2570, 1285)] * 3, (0, 1, 0)]
+    columns = {n: np.array(v, k) for (n, k), v in zip(kinds.items(), values, strict=True)}
+    buffers = libe57.VectorSourceDestBuffer()
+    for name, column in columns.items():
+        buffers.append(libe57.SourceDestBuffer(image, name, column, 3, True))
+    writer = points.writer(buffers)
+    writer.write(3)
+    writer.close()
+    image.close()
+    xyz = [[3, 2, 3], [1, 4, 3], [1, 2, 5]]
+    check(tmp_path / "scan.e57", xyz, [[2, 2, 2], [0, 0, 0], [5, 5, 5]], 1e-9)
+
+
 @pytest.mark.parametrize("name", TABLES)
 @settings(max_examples=5, deadline=None)
 @given(size=st.integers(1, 99))
@@ -97,6 +150,98 @@ def test_glb_of_a_scene(tmp_path, points):
     scene.export(tmp_path / "scene.glb")
     check(tmp_path / "scene.glb", xyz + 5, rgb, 1e-5)
     assert open_cloud(tmp_path / "scene.glb").findings[0].kind == "meshes-left-out"
+
+
+def write_glb(path, body, accessors, views, node=None, extensions=()):
+    attributes = dict(zip(("POSITION", "COLOR_0"), range(len(accessors)), strict=False))
+    content = {
+        "asset": {"version": "2.0"}, "extensionsRequired": list(extensions),
+        "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0, **(node or {})}],
+        "meshes": [{"primitives": [{"mode": 0, "attributes": attributes}]}],
+        "accessors": accessors, "bufferViews": [{"buffer": 0, **view} for view in views],
+        "buffers": [{"byteLength": len(body)}],
+    }  # fmt: skip
+    text = json.dumps(content).encode()
+    text, body = text + b" " * (-len(text) % 4), body + bytes(-len(body) % 4)
+    head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(body), len(text), 0x4E4F534A)
+    path.write_bytes(head + text + struct.pack("<II", len(body), 0x004E4942) + body)
+
+
+@pytest.mark.parametrize(
+    ("component", "kind", "full"),
+    [(5120, "i1", 127), (5121, "u1", 255), (5122, "<i2", 32767), (5123, "<u2", 65535)],
+)
+def test_glb_of_normalised_integers(tmp_path, points, component, kind, full):
+    """glTF 2.0, 3.6.2.2: f = c / 255, max(c / 127, -1), c / 65535, max(c / 32767, -1)."""
+    info, rgb = np.iinfo(kind), points[1]
+    padded = np.zeros((NUM, 4), kind)  # rows of positions begin at multiples of 4 bytes
+    padded[:, :3] = np.random.default_rng(0).integers(info.min, info.max + 1, (NUM, 3))
+    padded[0, :3], wide = info.min, np.zeros((NUM, 4), "<u2")
+    wide[:, :3] = rgb * np.uint16(257)
+    body, stride = padded.tobytes() + wide.tobytes(), 4 * padded.itemsize
+    write_glb(
+        tmp_path / "a.glb",
+        body,
+        [
+            {"bufferView": 0, "componentType": component, "normalized": True, "type": "VEC3"}
+            | {"count": NUM},
+            {"bufferView": 1, "componentType": 5123, "normalized": True, "type": "VEC4"}
+            | {"count": NUM},
+        ],
+        [
+            {"byteLength": NUM * stride, "byteStride": stride},
+            {"byteOffset": NUM * stride, "byteLength": NUM * 8},
+        ],
+        {"scale": [2, 2, 2], "translation": [1, 0, 0]},
+        ["KHR_mesh_quantization"],
+    )
+    xyz = np.maximum(padded[:, :3] / full, -1) * 2 + (1, 0, 0)
+    check(tmp_path / "a.glb", xyz, rgb)
+
+
+@pytest.mark.parametrize("has_base", [True, False])
+def test_glb_of_sparse_values(tmp_path, has_base):
+    """3.6.2.3: the values at the indices replace those of the view, or zeros without one."""
+    base, new = np.arange(30, dtype="<f4").reshape(10, 3), np.full((2, 3), 7.5, "<f4")
+    body = base.tobytes() + np.array([1, 9], "<u2").tobytes() + new.tobytes()
+    sparse = {"indices": {"bufferView": 1, "componentType": 5123}, "values": {"bufferView": 2}}
+    accessor = {"componentType": 5126, "count": 10, "type": "VEC3"}
+    accessor |= {"sparse": {"count": 2, **sparse}} | ({"bufferView": 0} if has_base else {})
+    views = [(0, 120), (120, 4), (124, 24)]
+    views = [{"byteOffset": start, "byteLength": size} for start, size in views]
+    write_glb(tmp_path / "a.glb", body, [accessor], views)
+    expected = base if has_base else np.zeros_like(base)
+    expected[[1, 9]] = 7.5
+    check(tmp_path / "a.glb", expected, None, size=4)
+    for name, found in (
+        ("KHR_draco_mesh_compression", "Draco"),
+        ("EXT_meshopt_compression", "meshopt"),
+    ):
+        write_glb(tmp_path / "a.glb", body, [accessor], views, extensions=[name])
+        with pytest.raises(SceneFormatError, match=found):
+            open_cloud(tmp_path / "a.glb")
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary", "Binary_Compressed"])
+def test_pcd_of_lower_case_with_fields_in_any_order(tmp_path, points, form):
+    xyz, rgb = points[0].astype("<f4"), points[1]
+    kind = [("normal", "<f4", 3), ("RGBA", "<u4"), ("Z", "<f4"), ("y", "<f4"), ("X", "<f8")]
+    rows = np.zeros(NUM, kind)
+    rows["RGBA"] = rgb @ np.array([1 << 16, 1 << 8, 1], np.uint32) | np.uint32(255 << 24)
+    rows["X"], rows["y"], rows["Z"] = xyz.T
+    head = "# .PCD v0.7\nversion .7\nfields normal RGBA Z y X\nsize 4 4 4 4 8\ntype f u f f f\n"
+    head += f"count 3 1 1 1 1\nwidth {NUM}\nheight 1\nviewpoint 0 0 0 1 0 0 0\ndata {form}\n"
+    body = rows.tobytes()
+    if form == "ascii":
+        lines = [f"0 0 0 {c} {z!r} {y!r} {x!r}" for _, c, z, y, x in rows.tolist()]
+        body = "\n".join(lines).encode()
+    elif form != "binary":
+        columns = b"".join(np.ascontiguousarray(rows[name]).tobytes() for name, *_ in kind)
+        runs = (columns[at : at + 32] for at in range(0, len(columns), 32))
+        packed = b"".join(bytes([len(run) - 1]) + run for run in runs)
+        body = struct.pack("<II", len(packed), len(columns)) + packed
+    (tmp_path / "a.pcd").write_bytes(head.encode() + body)
+    check(tmp_path / "a.pcd", xyz, rgb)
 
 
 @pytest.mark.parametrize(
@@ -135,6 +280,37 @@ def test_text_of_several_writers(tmp_path, points, name, header, delimiter, colo
         path.write_text(path.read_text().replace(".", ","))
     check(path, xyz, rgb if colors else None)
     assert bool(open_cloud(path).findings) == (header is None)
+
+
+def test_text_as_programs_write_it(tmp_path, points):
+    """Several scans in a PTS, commas at the ends of lines, a byte order mark, point numbers."""
+    xyz, rgb = points
+    rows = [
+        f"{a[0]} {a[1]} {a[2]} -900 {c[0]} {c[1]} {c[2]}" for a, c in zip(xyz, rgb, strict=True)
+    ]
+    plain = [row.replace(" -900", "") for row in rows]
+    commas = [row.replace(" ", ",") for row in plain]
+    files = {
+        "blocks.pts": ["100", *rows[:100], f"{NUM - 100}", *rows[100:]],
+        "recap.pts": plain,
+        "ends.csv": [row + "," for row in commas],
+        "named.csv": ["\ufeffx [m],y [m],z [m],R,G,B,", *(row + "," for row in commas)],
+        "marked.txt": ["\ufeff" + plain[0], *plain[1:]],
+        "labelled.csv": ["Name,X,Y,Z,R,G,B", *(f"wall {i},{row}" for i, row in enumerate(commas))],
+        "quoted.csv": ["x,y,z,r,g,b", *('"' + row.replace(",", '","') + '"' for row in commas)],
+        "numbered.txt": [f"{i + 5}\t{row}" for i, row in enumerate(plain)],
+        "a.xyzrgb": [row.replace(" -900", "") for row in rows],
+    }
+    for name, lines in files.items():
+        (tmp_path / name).write_text("\n".join(lines) + "\n", encoding="utf-8")
+        check(tmp_path / name, xyz, rgb)
+
+
+def test_files_of_other_programs_are_refused_by_name(tmp_path):
+    for name, found in (("a.ptx", "CloudCompare"), ("a.rcp", "ReCap"), ("a.obj", "a mesh")):
+        (tmp_path / name).write_bytes(b"1")
+        with pytest.raises(SceneFormatError, match=found):
+            open_cloud(tmp_path / name)
 
 
 def test_normals_are_not_taken_for_colours(tmp_path, points):

@@ -7,7 +7,7 @@ depth maps.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -118,6 +118,7 @@ def survey(
     demo: Path | None = None,
     with_depth: bool = False,
     with_cloud: bool = False,
+    columns: Sequence[str] = (),
     progress: Progress = silent,
     note: Note = silent_note,
 ) -> SceneFacts:
@@ -129,6 +130,7 @@ def survey(
             facts.
         with_depth: Whether a method needs depth maps.
         with_cloud: Whether a method needs the scan.
+        columns: Those of a scan that is a text file, as of ``open_cloud``.
         progress: Reports progress.
         note: Takes what was found out about the scene.
 
@@ -156,7 +158,7 @@ def survey(
     maps = scan = ""
     if with_cloud and planned.cloud:
         scan = str(Path(planned.cloud).resolve())
-        open_cloud(Path(planned.cloud))  # reports an invalid header now
+        open_cloud(Path(planned.cloud), columns)  # reports an invalid header now
     depth = Path(planned.depth or scene.source.root or path)
     if with_depth and (planned.depth or search_depths(scene, depth) is not None):
         maps, scene = str(depth.resolve()), with_depths_in(scene, depth)

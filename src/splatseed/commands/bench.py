@@ -14,7 +14,16 @@ import tyro
 from rich.progress import BarColumn, Progress as Bar, TaskID, TextColumn, TimeRemainingColumn
 
 from splatseed.bench.job import Machine, RunOptions, execute_runs, local_machine, ray_machine
-from splatseed.bench.plan import DEPTH, SFM, Plan, RunSpec, fair_budget, needs_cloud, plan_runs
+from splatseed.bench.plan import (
+    CLOUD,
+    DEPTH,
+    SFM,
+    Plan,
+    RunSpec,
+    fair_budget,
+    needs_cloud,
+    plan_runs,
+)
 from splatseed.bench.plan_file import PLAN, plan_text, read_plan
 from splatseed.bench.runs import (
     ERROR,
@@ -224,11 +233,14 @@ def _prepare(
     missing, of_scenes = list[Finding](), list[Finding]()
     present = list[tuple[PlannedScene, SceneFacts]]()
     needs = {"with_depth": DEPTH in plan.methods, "with_cloud": any(map(needs_cloud, plan.methods))}
+    columns = plan.parameters.get(CLOUD, {}).get("columns", ())
     with stage_display() as clock:
         for scene in plan.scenes:
             noted = list[Finding]()
             try:
-                facts = survey(scene, demo=demo, **needs, progress=clock, note=noted.append)
+                facts = survey(
+                    scene, demo=demo, **needs, columns=columns, progress=clock, note=noted.append
+                )
             except SceneNotFoundError as error:
                 if options.data is None:
                     raise

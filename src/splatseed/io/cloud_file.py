@@ -39,10 +39,7 @@ _RGB_NAMES = (
     *((PACKED_RGB,), RGB, ("diffuse_red", "diffuse_green", "diffuse_blue")),
     *(("r", "g", "b"), _SH_NAMES),
 )
-_INTENSITY_NAMES = (
-    *("intensity", "scalar_intensity", "scalar_Intensity", "Intensity"),
-    *("reflectance", "scalar_Reflectance"),
-)
+_INTENSITY_NAMES = ("intensity", "reflectance", "reflectivity")
 _GREY = 128
 _WHITES = (255.0, 1023.0, 4095.0, 65535.0)
 """White of 8, 10, 12 and 16 bits."""
@@ -86,10 +83,12 @@ class CloudFile(ABC):
         count: Rows by the header; None if unknown. ``chunks`` may yield fewer points, since rows
             marked invalid are skipped.
         findings: Problems of the file.
+        may_be_linear: Whether colours may be linear, as the format says, or sRGB, as many write.
         used: Names of the columns that are read: positions and colours.
     """
 
     findings: tuple[Finding, ...] = ()
+    may_be_linear = False
 
     def __init__(self, path: Path, names: Iterable[str], count: int | None = None) -> None:
         self.path, self.count = path, count
@@ -238,13 +237,31 @@ class Dialect:
         """Parse the columns ``places`` of each line; raise ``ValueError`` if one is no number."""
         if self.decimal_comma:
             lines = [line.replace(",", ".") for line in lines]
+        quote = '"' if lines and '"' in lines[0] else None
         return np.loadtxt(
-            lines, np.float64, comments=None, delimiter=self.delimiter, usecols=places, ndmin=2
-        )
+            lines, np.float64, comments=None, delimiter=self.delimiter, usecols=places, ndmin=2,
+            quotechar=quote,
+        )  # fmt: skip
+
+
+def sample_lines(path: Path, offset: int, *, counts: bool = False) -> list[str]:
+    """Return lines spread over a file from ``offset`` on; ``counts`` as of ``LineCloud``."""
+    last = path.stat().st_size - SAMPLE_BYTES
+    places = {max(offset, offset + (last - offset) * i // (SAMPLES - 1)) for i in range(SAMPLES)}
+    lines: list[str] = []
+    with open_file(path) as file:
+        for place in sorted(places):
+            file.seek(place)
+            block = file.read(SAMPLE_BYTES).decode("latin-1").split("\n")
+            lines += _numbers(block[place > offset : -1] or block[:1], counts=counts)
+    return lines
 
 
 class LineCloud(CloudFile):
-    """Lines of numbers (XYZ, CSV, ascii PLY and PCD), read in blocks."""
+    """Lines of numbers (XYZ, CSV, ascii PLY and PCD), read in blocks.
+
+    With ``counts``, lines of one number are not points but numbers of points, as PTS files have.
+    """
 
     def __init__(
         self,
@@ -255,8 +272,10 @@ class LineCloud(CloudFile):
         *,
         dialect: Dialect | None = None,
         types: Mapping[str, np.dtype[Any]] | None = None,
+        counts: bool = False,
     ) -> None:
         super().__init__(path, names, count)
+        self._counts = counts
         self._places = [names.index(name) for name in self.used]
         self._offset, self._dialect, self._types = offset, dialect or Dialect(), types or {}
 
@@ -273,14 +292,7 @@ class LineCloud(CloudFile):
             )
 
     def _sample(self) -> Block:
-        first, last = self._offset, self.path.stat().st_size - SAMPLE_BYTES
-        places = {max(first, first + (last - first) * i // (SAMPLES - 1)) for i in range(SAMPLES)}
-        lines: list[str] = []
-        with open_file(self.path) as file:
-            for place in sorted(places):
-                file.seek(place)
-                block = file.read(SAMPLE_BYTES).decode("latin-1").split("\n")
-                lines += _numbers(block[place > first : -1] or block[:1])
+        lines = sample_lines(self.path, self._offset, counts=self._counts)
         return self._block(lines[: self.count], 0)
 
     def _block(self, lines: Sequence[str], num_before: int) -> Block:
@@ -322,10 +334,11 @@ class LineCloud(CloudFile):
             while data := file.read(_TEXT_BYTES):
                 whole, end, rest = (rest + data).rpartition(b"\n")
                 if end:
-                    yield _numbers(whole.decode("latin-1").split("\n"))
-        yield _numbers([rest.decode("latin-1")])
+                    yield _numbers(whole.decode("latin-1").split("\n"), counts=self._counts)
+        yield _numbers([rest.decode("latin-1")], counts=self._counts)
 
 
-def _numbers(lines: Sequence[str]) -> list[str]:
-    """Drop empty lines and comments."""
-    return [s for line in lines if (s := line.strip()) and s[0] != "#"]
+def _numbers(lines: Sequence[str], *, counts: bool) -> list[str]:
+    """Drop empty lines, comments and, with ``counts``, numbers of points."""
+    kept = [s for line in lines if (s := line.strip()) and s[0] not in "#/"]
+    return [line for line in kept if not line.isdecimal()] if counts else kept

@@ -1,14 +1,15 @@
 """Read point PLY files of any writer; write the layout that every 3DGS loader accepts.
 
-An *element* is a table; a *property* is a column of scalars or of lists. The vertices must be the
-first element and have no lists, as in practice. Counts are checked against the file before memory
-is allocated; elements after the vertices are ignored.
+An *element* is a table; a *property* is a column of scalars or of lists (OpenMVS lists the views of
+each vertex). Lists and other elements are skipped; elements before the vertices have no lists, as
+in practice. Names are read in lower case and without CloudCompare's ``scalar_``. Counts are checked
+against the file before memory is allocated.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,23 +17,35 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from splatseed.errors import SceneFormatError
-from splatseed.io.cloud_file import RGB, XYZ, CloudFile, LineCloud, RowCloud
+from splatseed.io.cloud_file import (
+    RGB,
+    SAMPLE_ROWS,
+    SAMPLES,
+    XYZ,
+    Block,
+    CloudFile,
+    LineCloud,
+    RowCloud,
+    check_min_size,
+)
 from splatseed.io.files import StrPath, check_fits_memory, open_file, translate_read_errors
 from splatseed.io.staging import atomic_file
 from splatseed.pointcloud import PointCloud
 from splatseed.text import beginning
 
-EXPORT_PLY_AGAIN = "Copy the file again, or export it again as a binary little-endian PLY."
+EXPORT_PLY_AGAIN = "Copy the file again, or export it again, if need be with another program."
 
 _TYPES = (
     {"char": "i1", "short": "i2", "int": "i4", "uchar": "u1", "ushort": "u2", "uint": "u4"}
     | {"int8": "i1", "int16": "i2", "int32": "i4", "uint8": "u1", "uint16": "u2", "uint32": "u4"}
     | {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
+    | {"int64": "i8", "uint64": "u8"}  # not in the format, but written
 )
 _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _END = re.compile(rb"^end_header[ \t]*(\r?\n|\Z)", re.MULTILINE)
 _COUNT = re.compile("[0-9]{1,19}")
 _MAX_HEADER = 1 << 20  # bytes searched for the end of the header
+_READ_BYTES = 1 << 24  # at a time, of rows with lists
 _GREY = 128
 _ROW = np.dtype(
     [(name, "<f4") for name in (*XYZ, "nx", "ny", "nz")] + [(name, "u1") for name in RGB]
@@ -46,12 +59,20 @@ _MODELS = {
 
 
 class Element(NamedTuple):
-    """A table: NumPy types of its columns by name, and whether any holds lists."""
+    """A table: NumPy types of its columns by name, and those of the lengths of lists."""
 
     name: str
     num_rows: int
     types: Mapping[str, str]
-    has_lists: bool = False
+    lengths: Mapping[str, str] = {}
+
+    @property
+    def has_lists(self) -> bool:
+        """Whether any column holds lists."""
+        return bool(self.lengths)
+
+
+_NOTHING = Element("no element", 0, {})
 
 
 class Header(NamedTuple):
@@ -95,7 +116,8 @@ def parse_header(path: Path, data: bytes) -> Header:
                 lists = kind[:1] == ["list"] and _TYPES.get(kind[-1], "f")[0] in "iu"
                 if name not in last.types and (not kind or (lists and len(kind) == 2)):
                     types = {**last.types, name: _TYPES[of]}
-                    elements[-1] = Element(*last[:2], types, last.has_lists or lists)
+                    lengths = {name: _TYPES[kind[1]]} if lists else {}
+                    elements[-1] = Element(*last[:2], types, {**last.lengths, **lengths})
                     continue
         raise SceneFormatError(
             f"a format, an element or one of its properties in the header of {path}, line {number}",
@@ -113,24 +135,140 @@ def open_ply(path: Path) -> CloudFile:
         header = parse_header(path, file.read(_MAX_HEADER))
     if any("packed_position" in each.types for each in header.elements):
         refuse_gaussians(path, "Gaussians compressed as PlayCanvas's .compressed.ply")
-    vertex = header.elements[0] if header.elements else Element("no element", 0, {})
-    names = list(vertex.types)
-    if vertex.name != "vertex" or not set(XYZ) <= set(names) or vertex.has_lists:
+    names = [each.name for each in header.elements]
+    first = names.index("vertex") if "vertex" in names else 0
+    before, (vertex, *_) = header.elements[:first], (*header.elements[first:], _NOTHING)
+    vertex = _with_known_names(vertex)
+    if vertex.name != "vertex" or not set(XYZ) <= vertex.types.keys() - vertex.lengths.keys():
         raise SceneFormatError(
-            f"{path} to begin with vertices that have x, y, z and no lists",
-            found=f"{vertex.name} with {', '.join(names)[:200] or 'no properties'}",
-            fix=EXPORT_PLY_AGAIN,
+            f"{path} to have vertices with x, y, z",
+            found=f"{vertex.name} with {', '.join(vertex.types)[:200] or 'no properties'}",
+            fix="Export it again with positions.",
         )
-    dtype = header.dtype(vertex)
+    if any(each.has_lists for each in before):
+        raise SceneFormatError(
+            f"{path} to begin with vertices",
+            found=f"{before[0].name} before them",
+            fix="Save it again with a program that writes vertices first, such as CloudCompare.",
+        )
+    offset = _start(path, header, before)
     if header.byte_order:
-        return RowCloud(path, dtype, header.size, vertex.num_rows)
+        if vertex.has_lists:
+            return _ListCloud(path, header, vertex, offset)
+        return RowCloud(path, header.dtype(vertex), offset, vertex.num_rows)
     # Keep bytes; wider integer types may hold any range.
     integers = {
-        n: dtype[n] if dtype[n] == np.uint8 else np.dtype(np.int64)
-        for n in names
-        if dtype[n].kind in "iu" and n not in XYZ
+        name: np.dtype(kind if kind == "u1" else np.int64)
+        for name, kind in vertex.types.items()
+        if kind[0] in "iu" and name not in XYZ
     }
-    return LineCloud(path, names, header.size, vertex.num_rows, types=integers)
+    if vertex.has_lists:
+        return _ListLines(path, vertex, offset, integers)
+    return LineCloud(path, list(vertex.types), offset, vertex.num_rows, types=integers)
+
+
+def _with_known_names(element: Element) -> Element:
+    """Return an element with its names in lower case and without ``scalar_``, if still unique."""
+    known = [name.lower().removeprefix("scalar_") for name in element.types]
+    new = {
+        old: name if known.count(name) == 1 else old
+        for old, name in zip(element.types, known, strict=True)
+    }
+    types = {new[name]: kind for name, kind in element.types.items()}
+    lengths = {new[name]: kind for name, kind in element.lengths.items()}
+    return Element(element.name, element.num_rows, types, lengths)
+
+
+def _start(path: Path, header: Header, before: Sequence[Element]) -> int:
+    """Return the offset of the rows that follow elements without lists."""
+    if header.byte_order:
+        return header.size + sum(each.num_rows * header.dtype(each).itemsize for each in before)
+    with open_file(path) as file:
+        file.seek(header.size)
+        for _ in range(sum(each.num_rows for each in before)):
+            if not file.readline():
+                break
+        return file.tell()
+
+
+class _ListCloud(CloudFile):
+    """Binary rows of scalars and lists, which are skipped."""
+
+    def __init__(self, path: Path, header: Header, vertex: Element, offset: int) -> None:
+        scalars = [name for name in vertex.types if name not in vertex.lengths]
+        super().__init__(path, scalars, vertex.num_rows)
+        self._offset, self._is_big = offset, header.byte_order == ">"
+        self._num_rows = vertex.num_rows
+        # Where each used column is: the run of scalars, between lists, and the place there.
+        runs: list[list[int]] = [[0, 0, 0]]  # bytes, then those of the list's length and items
+        self._columns: dict[str, tuple[int, int, np.dtype[Any]]] = {}
+        for name, kind in vertex.types.items():
+            dtype = np.dtype(header.byte_order + kind)
+            if name in vertex.lengths:
+                runs[-1][1:] = np.dtype(vertex.lengths[name]).itemsize, dtype.itemsize
+                runs.append([0, 0, 0])
+            else:
+                self._columns[name] = len(runs) - 1, runs[-1][0], dtype
+                runs[-1][0] += dtype.itemsize
+        self._runs = np.array(runs, np.int64)
+        least = int(self._runs[:, :2].sum())
+        check_min_size(path, offset + vertex.num_rows * least)
+
+    def _sample(self) -> Block:
+        """Read the first rows: where others are is known only after those before them."""
+        none = {name: np.empty(0, self._columns[name][2]) for name in self.used}
+        return next(self._blocks(SAMPLES * SAMPLE_ROWS), none)
+
+    def _blocks(self, size: int) -> Iterator[Block]:
+        from splatseed.io._kernels import find_rows  # noqa: PLC0415  (Numba)
+
+        data, end, given = np.empty(0, np.uint8), 0, 0
+        with open_file(self.path) as file:
+            file.seek(self._offset)
+            while given < self._num_rows:
+                data = data[end:]
+                starts = np.empty((min(size, self._num_rows - given), len(self._runs)), np.int64)
+                num, end = find_rows(data, 0, self._runs, self._is_big, starts)
+                while num < len(starts):
+                    more = file.read(max(_READ_BYTES, len(data)))
+                    if not more:
+                        check_min_size(self.path, file.tell() + 1)  # raises: a row is cut
+                    data = np.concatenate([data, np.frombuffer(more, np.uint8)])
+                    added, end = find_rows(data, end, self._runs, self._is_big, starts[num:])
+                    num += added
+                yield {name: self._column(name, data, starts) for name in self.used}
+                given += num
+
+    def _column(self, name: str, data: np.ndarray, starts: np.ndarray) -> np.ndarray:
+        run, place, dtype = self._columns[name]
+        where = starts[:, run, None] + (place + np.arange(dtype.itemsize))
+        return np.ascontiguousarray(data[where]).view(dtype)[:, 0]
+
+
+class _ListLines(LineCloud):
+    """Lines of numbers and lists, which are removed."""
+
+    def __init__(
+        self, path: Path, vertex: Element, offset: int, types: Mapping[str, np.dtype[Any]]
+    ) -> None:
+        self._are_lists = [name in vertex.lengths for name in vertex.types]
+        scalars = [name for name in vertex.types if name not in vertex.lengths]
+        super().__init__(path, scalars, offset, vertex.num_rows, types=types)
+
+    def _block(self, lines: Sequence[str], num_before: int) -> Block:
+        return super()._block([self._without_lists(line) for line in lines], num_before)
+
+    def _without_lists(self, line: str) -> str:
+        fields, kept, at = line.split(), list[str](), 0
+        for is_list in self._are_lists:
+            if at >= len(fields) or (is_list and not _COUNT.fullmatch(fields[at])):
+                return f"? {line}"  # reported as no row of numbers
+            if is_list:
+                at += int(fields[at])
+            else:
+                kept.append(fields[at])
+            at += 1
+        return " ".join(kept)
 
 
 def read_ply(path: StrPath) -> PointCloud:

@@ -85,6 +85,28 @@ def test_without_colours_free_space_drops_ghosts(room, room_capture, scan, tmp_p
     np.testing.assert_array_equal(new[False].rgb, new_points(ss.upsample(room, black)).rgb)
 
 
+def test_points_that_the_scan_left_black_or_filled_take_the_photographs_colours(
+    room, scan, seeds, tmp_path
+):
+    right = new_points(seeds[0])
+    left = scan[0][:, 0] > 0
+    random = np.random.default_rng(0).random(len(left)) < 0.5
+    for which, filling in ((random, 0), (left, 128)):
+        rgb = np.where(which[:, None], filling, scan[1]).astype(np.uint8)
+        notes = []
+        new = new_points(
+            ss.upsample(room, Cloud().of(written(tmp_path, (scan[0], rgb))), note=notes.append)
+        )
+        (text,) = [each.text for each in notes if each.kind == "colors-of-photographs"]
+        assert "no colour in the cloud" in text
+        assert abs(len(new) - len(right)) < 0.05 * len(right)
+        nearest = KDTree(right.xyz).query(new.xyz)[1]
+        difference = np.abs(new.rgb.astype(int) - right.rgb[nearest]).max(axis=1)
+        assert np.median(difference) < 8
+        assert np.quantile(difference, 0.95) < 64
+        assert (new.rgb == filling).all(axis=1).mean() < 0.01
+
+
 def test_a_national_grid_and_another_scale_lose_no_precision(room, scan, seeds, tmp_path):
     moved = written(tmp_path, (MOVE.points(scan[0]), scan[1]))
     again = ss.upsample(room, Cloud().of(moved, transform=MOVE.inverse))

@@ -80,3 +80,13 @@ def test_even_voxels_fit_their_capacity_at_the_smallest_side(rng):
     assert 250 <= len(voxels) <= 1000
     cells = np.floor((voxels.xyz + VOXEL_ORIGIN) / voxels.side[0])
     assert len(np.unique(cells, axis=0)) == len(cells)
+
+
+def test_black_points_have_no_colour():
+    xyz = np.array([[0.1, 0.1, 3.0], [0.1, 0.1, 3.0], [0.1, 0.1, 3.0], [0.9, 0.1, 3.0]])
+    rgb = np.array([[10, 20, 30], [0, 0, 0], [20, 40, 50], [0, 0, 0]], np.uint8)
+    voxels = Voxels(64)
+    voxels.add(xyz, rgb)
+    assert voxels.count.tolist() == [3, 1]
+    assert voxels.rgb.tolist() == [[15, 30, 40], [0, 0, 0]]
+    assert voxels.has_color.tolist() == [True, False]

@@ -65,8 +65,9 @@ def run(arguments: list[str]) -> None:
     check_output(options.output, kind="upsample", overwrite=options.overwrite, protect=protect)
     if options.gaussians is not None:
         check_free(options.gaussians, overwrite=options.overwrite, protect=protect)
+    clouds: Any = methods[CLOUD]
     for file in options.cloud_files:
-        open_cloud(file)  # reads the header, so that a bad file fails before work starts
+        open_cloud(file, clouds.columns)  # reads the header, so that a bad file fails first
     _upsample(options, methods, arguments)
 
 
@@ -294,18 +295,18 @@ def load_cloud(options: Options, scene: Scene, method: Cloud, progress: Progress
     if options.cloud_transform is not None:
         transform = read_cloud_transform(options.cloud_transform, scene)
         transform = transform.then(Similarity(1.0, np.eye(3), -scene.origin))
-    elif not options.align and (shift := find_shift(scene, _sample(files))).any():
+    elif not options.align and (shift := find_shift(scene, _sample(files, method.columns))).any():
         transform = Similarity(1.0, np.eye(3), shift)
     if options.align:
         from splatseed.seeding.clouds.align import align_cloud
 
-        alignment = align_cloud(scene, files, progress)
+        alignment = align_cloud(scene, files, progress, columns=method.columns)
         transform = alignment.scene_from_cloud
     given = method.of(*files, transform=transform, memory=memory)
     return LoadedCloud(scene, given, memory_note, alignment)
 
 
-def _sample(files: Sequence[Path]) -> Float64[np.ndarray, "N 3"]:
+def _sample(files: Sequence[Path], columns: Sequence[str]) -> Float64[np.ndarray, "N 3"]:
     """Return the finite ones among the first points of each file."""
-    firsts = (next(iter(open_cloud(file).chunks(SAMPLE)), None) for file in files)
+    firsts = (next(iter(open_cloud(file, columns).chunks(SAMPLE)), None) for file in files)
     return np.concatenate([np.empty((0, 3)), *(c.xyz[c.finite] for c in firsts if c is not None)])

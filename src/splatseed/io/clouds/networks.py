@@ -4,8 +4,10 @@ NPZ: positions are the first array of ``POSITIONS`` found, of shape [..., 3]; co
 ``COLORS`` of the same size, with channels last or before rows and columns. ``MASKS`` select points;
 points whose ``CONFIDENCES`` are below ``MIN_CONFIDENCE`` are dropped. GLB (binary glTF): if any
 primitive is of points, only those are read, since exporters draw cameras as triangles beside them;
-otherwise the vertices of all meshes. (trimesh loads the whole file into memory, and turns vertices
-that it cannot decompress into zeros; here they are refused.)
+otherwise the vertices of all meshes. Normalised integers are divided as glTF 2.0 says (3.11). Its
+colours are linear, but exporters of points store those of photographs: ``may_be_linear``. (trimesh
+loads the whole file into memory, and turns vertices that it cannot decompress into zeros, as it
+does to sparse ones; here they are refused, and sparse ones read.)
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import json
 import math
 import struct
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,6 +44,20 @@ _GLTF = (b"glTF", 2, 0x4E4F534A)
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"VEC3": 3, "VEC4": 4}
 _POINTS, _TRIANGLES = 0, 4
+_UNPACK = "Run gltfpack IN.glb -o OUT.glb without -c, or save it without compression."
+_NOT_READ = {
+    "KHR_draco_mesh_compression": (
+        "vertices compressed by Draco",
+        "Decompress it with gltf-transform cp IN.glb OUT.glb.",
+    ),
+    "EXT_meshopt_compression": ("vertices compressed by meshoptimizer", _UNPACK),
+    "KHR_meshopt_compression": ("vertices compressed by meshoptimizer", _UNPACK),
+    "EXT_mesh_gpu_instancing": (
+        "meshes repeated by their renderer",
+        "Save each as a mesh of its own, or sample points of them.",
+    ),
+}
+"""Extensions that change vertices: what they are, and how to do without."""
 _NPZ = "an archive of NumPy arrays"
 _GLB = "a complete .glb file with vertices"
 
@@ -110,17 +126,50 @@ class NpzCloud(CloudFile):
             return array.reshape(-1, width)
 
 
+class _Table(NamedTuple):
+    """An accessor: a row of numbers per vertex.
+
+    ``rows`` is None if all are 0 where ``changed``, the sparse values by their rows, has none.
+    """
+
+    rows: RowCloud | None
+    num_rows: int
+    item: np.dtype[Any]
+    full: float  # what normalised integers are divided by; 1 without
+    changed: tuple[np.ndarray, np.ndarray]
+
+    def raw(self, start: int, size: int) -> np.ndarray:
+        """Read rows from ``start``, at most ``size``, as they are stored."""
+        number = min(size, self.num_rows - start)
+        zero = np.zeros((number, *self.item.shape), self.item.base)
+        values = zero if self.rows is None else self.rows.rows(start, size)["values"]
+        at, new = self.changed
+        here = (at >= start) & (at < start + number)
+        if here.any():
+            values = values.copy()
+            values[at[here].astype(np.int64) - start] = new[here]
+        return values
+
+    def read(self, start: int, size: int) -> Float64[np.ndarray, "n C"]:
+        """Read rows as numbers: glTF 2.0, 3.6.2.2 and KHR_mesh_quantization."""
+        with np.errstate(invalid="ignore"):
+            values = self.raw(start, size).astype(np.float64)
+        return values if self.full == 1 else np.maximum(values / self.full, -1.0)
+
+
 class _Part(NamedTuple):
     """Vertices of a primitive of a node; ``matrix`` maps them to the scene."""
 
     mode: int
     matrix: Float64[np.ndarray, "4 4"]
-    position: RowCloud
-    color: RowCloud | None
+    position: _Table
+    color: _Table | None
 
 
 class GlbCloud(CloudFile):
     """A .glb file."""
+
+    may_be_linear = True
 
     def __init__(self, path: Path) -> None:
         with translate_errors(path, _GLB), open_file(path) as file:
@@ -128,6 +177,10 @@ class GlbCloud(CloudFile):
             if (magic, version, kind) != _GLTF or length > path.stat().st_size:
                 raise ValueError("no binary glTF of version 2")
             content = json.loads(file.read(length))
+            nodes = [
+                name for node in content.get("nodes", []) for name in node.get("extensions", {})
+            ]
+            _check_extensions(path, [*content.get("extensionsRequired", []), *nodes])
             parts = list(_primitives(path, content, file.tell() + 8))
             points = [part for part in parts if part.mode == _POINTS]
             self._parts = points or parts
@@ -148,11 +201,11 @@ class GlbCloud(CloudFile):
             for part in self._parts:
                 for start in range(0, part.position.num_rows, size):
                     with np.errstate(invalid="ignore", over="ignore"):
-                        xyz = part.position.rows(start, size)["values"].astype(np.float64)
+                        xyz = part.position.read(start, size)
                         xyz = xyz @ part.matrix[:3, :3].T + part.matrix[:3, 3]
                     block = dict(zip(XYZ, xyz.T, strict=True))
                     if part.color and self._rgb:
-                        values = part.color.rows(start, size)["values"][:, :3]
+                        values = part.color.raw(start, size)[:, :3]
                         # glTF normalises integers by their largest value.
                         full = 1 if values.dtype.kind == "f" else np.iinfo(values.dtype).max
                         block |= zip(RGB, to_uint8(values, full).T, strict=True)
@@ -162,8 +215,7 @@ class GlbCloud(CloudFile):
 def _primitives(path: Path, content: Mapping[str, Any], body: int) -> Iterator[_Part]:
     for mesh, matrix in _placed(content):
         for primitive in content["meshes"][mesh]["primitives"]:
-            if "KHR_draco_mesh_compression" in primitive.get("extensions", {}):
-                raise ValueError("vertices compressed by Draco")
+            _check_extensions(path, primitive.get("extensions", {}))
             tables = {
                 name: _table(path, content, accessor, body)
                 for name, accessor in primitive["attributes"].items()
@@ -206,15 +258,62 @@ def _matrix(node: Mapping[str, Any]) -> Float64[np.ndarray, "4 4"]:
     return matrix
 
 
-def _table(path: Path, content: Mapping[str, Any], index: int, body: int) -> RowCloud:
-    """Return the rows of an accessor, which may be interleaved with others."""
+def _check_extensions(path: Path, names: Iterable[str]) -> None:
+    """Raise ``SceneFormatError`` if vertices are stored in a way that is not read."""
+    for name in names:
+        if name in _NOT_READ:
+            what, fix = _NOT_READ[name]
+            raise SceneFormatError(
+                f"{path} to have vertices that are not compressed",
+                found=f"{what} ({name})",
+                fix=fix,
+            )
+
+
+def _table(path: Path, content: Mapping[str, Any], index: int, body: int) -> _Table:
+    """Return an accessor."""
     accessor = content["accessors"][index]
-    view = content["bufferViews"][accessor["bufferView"]]
-    if view.get("buffer", 0) != 0 or "sparse" in accessor:
-        raise ValueError("vertices in another file, or sparse")
-    item = np.dtype((_TYPES[accessor["componentType"]], (_WIDTHS[accessor["type"]],)))
-    stride, at = int(view.get("byteStride", 0)) or item.itemsize, int(accessor.get("byteOffset", 0))
+    kind, count = np.dtype(_TYPES[accessor["componentType"]]), int(accessor["count"])
+    item = np.dtype((kind, (_WIDTHS[accessor["type"]],)))
+    full = float(np.iinfo(kind).max) if accessor.get("normalized") and kind.kind in "iu" else 1.0
+    rows = None
+    if "bufferView" not in accessor and count > path.stat().st_size:
+        raise ValueError(f"{count:,} vertices without bytes")
+    if "bufferView" in accessor:
+        rows = _rows(path, content, accessor, item, count, body)
+    changed = np.empty(0, np.int64), np.empty((0, *item.shape), kind)
+    if "sparse" in accessor:
+        sparse, number = accessor["sparse"], int(accessor["sparse"]["count"])
+        at = np.dtype((_TYPES[sparse["indices"]["componentType"]], (1,)))
+        changed = (
+            _rows(path, content, sparse["indices"], at, number, body).rows(0, number)["values"][
+                :, 0
+            ],
+            _rows(path, content, sparse["values"], item, number, body).rows(0, number)["values"],
+        )
+    return _Table(rows, count, item, full, changed)
+
+
+def _rows(
+    path: Path,
+    content: Mapping[str, Any],
+    where: Mapping[str, Any],
+    item: np.dtype[Any],
+    count: int,
+    body: int,
+) -> RowCloud:
+    """Return the rows of a part of the body, which may be interleaved with others."""
+    view = content["bufferViews"][where["bufferView"]]
+    if view.get("buffer", 0) != 0 or "uri" in content["buffers"][0]:
+        _check_extensions(path, view.get("extensions", {}))
+        raise SceneFormatError(
+            f"{path} to hold its vertices",
+            found="them in another file",
+            fix="Save it as one .glb, for instance in Blender.",
+        )
+    stride, at = int(view.get("byteStride", 0)) or item.itemsize, int(where.get("byteOffset", 0))
     within = at % stride if stride > item.itemsize else 0
     layout: Any = {"names": ["values"], "formats": [item], "offsets": [within], "itemsize": stride}
-    start = body + int(view.get("byteOffset", 0)) + at - within
-    return RowCloud(path, np.dtype(layout), start, int(accessor["count"]))
+    return RowCloud(
+        path, np.dtype(layout), body + int(view.get("byteOffset", 0)) + at - within, count
+    )

@@ -80,9 +80,10 @@ def _parse_header(data: bytes) -> tuple[np.dtype[Any], int, str, int]:
     while "DATA" not in known and (end := data.find(b"\n", at)) >= 0:
         fields = data[at:end].decode("latin-1").split()
         if fields and not fields[0].startswith("#"):
-            known[fields[0].upper()] = fields[1:]
+            known[fields[0].upper()] = fields[1:]  # PCL reads keys and types in any case
         at = end + 1
-    names, sizes, kinds = known["FIELDS"], known["SIZE"], known["TYPE"]
+    names, sizes = [name.lower() for name in known["FIELDS"]], known["SIZE"]
+    kinds = [kind.upper() for kind in known["TYPE"]]
     counts = [int(each) for each in known.get("COUNT", ["1"] * len(names))]
     packed = next((name for name in ("rgb", "rgba") if name in names), None)
     layout: list[Any] = []

@@ -1,7 +1,8 @@
 """Laser scans: LAS and LAZ by laspy with lazrs, E57 by pye57 (libE57Format).
 
 LAS: withheld points are skipped; if all colours are 0, varying intensity is used instead. E57: the
-points of all scans, moved to the common frame by the scans' poses; invalid points are skipped.
+points of all scans, moved to the common frame by the scans' poses; invalid points are skipped, and
+invalid colours black. A rotation of 0 is none; white is a scan's colour limit, if its values fit.
 Promise: a truncated LAZ file is an error, not a shorter cloud. Its chunk table is checked before
 lazrs, which aborts the process on huge allocations, reads it.
 """
@@ -11,14 +12,18 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import cached_property
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+from jaxtyping import Float64
 
+from splatseed.camera import rotation_from_quat
+from splatseed.findings import Finding
 from splatseed.io import cloud_file
-from splatseed.io.cloud_file import RGB, XYZ, Block, CloudFile
+from splatseed.io.cloud_file import RGB, XYZ, Block, CloudFile, to_uint8, white_level
 from splatseed.io.files import translate_errors
 from splatseed.requirements import require
 
@@ -30,7 +35,8 @@ _MAX_BYTES = 1 << 30
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _AXES = (("cartesianX", "cartesianY", "cartesianZ"), _SPHERICAL)
 _E57_COLORS = {"colorRed": "red", "colorGreen": "green", "colorBlue": "blue"}
-_INVALID = ("cartesianInvalidState", "sphericalInvalidState")
+_INVALID, _NO_COLOR = ("cartesianInvalidState", "sphericalInvalidState"), "isColorInvalid"
+_BYTE = 255.0
 
 
 class LasCloud(CloudFile):
@@ -142,27 +148,87 @@ class E57Cloud(CloudFile):
 
     def __init__(self, path: Path) -> None:
         require("pye57")
+        findings = []
         with _opened_e57(path) as (_, headers):
             if not headers:
                 raise ValueError("no scans")
             shared = set.intersection(*(set(header.point_fields) for header in headers))
             count = sum(int(header.point_count) for header in headers)
+            self._poses = [_pose(header, f"scan {i + 1}") for i, header in enumerate(headers)]
+        zero = [str(i + 1) for i, (quat, _) in enumerate(self._poses) if not quat.any()]
+        if zero:
+            text = f"The rotation of scan {', '.join(zero)} is (0, 0, 0, 0): none is applied."
+            findings.append(Finding("zero-rotation", text))
         super().__init__(path, (_E57_COLORS.get(name, name) for name in (*XYZ, *shared)), count)
+        self.findings = tuple(findings)
+
+    @cached_property
+    def _heads(self) -> tuple[list[float], Block]:
+        """White of each scan, and the start of all scans."""
+        size, whites, heads = cloud_file.SAMPLES * cloud_file.SAMPLE_ROWS, list[float](), []
+        with _opened_e57(self.path) as (image, headers):
+            for header, pose in zip(headers, self._poses, strict=True):
+                head = next(_read_scan(image, header, pose, size), {})
+                known = [head[name] for name in RGB if name in head and self._rgb]
+                whites.append(_white(header, np.stack(known, axis=1)) if known else 255.0)
+                heads.append(_with_bytes(head, whites[-1]))
+        none = np.empty(0)
+        return whites, {
+            n: np.concatenate([h[n] for h in heads if n in h] or [none]) for n in self.used
+        }
 
     def _sample(self) -> Block:
-        """Read the start of each scan."""
-        with _opened_e57(self.path) as (image, headers):
-            heads = [
-                next(_read_scan(image, h, cloud_file.SAMPLES * cloud_file.SAMPLE_ROWS), {})
-                for h in headers
-            ]
-        none = np.empty(0)
-        return {n: np.concatenate([none, *(h.get(n, none) for h in heads)]) for n in self.used}
+        """Return the start of each scan."""
+        return self._heads[1]
 
     def _blocks(self, size: int) -> Iterator[Block]:
+        whites = self._heads[0]
         with _opened_e57(self.path) as (image, headers):
-            for header in headers:
-                yield from _read_scan(image, header, size)
+            for header, pose, white in zip(headers, self._poses, whites, strict=True):
+                for block in _read_scan(image, header, pose, size):
+                    yield _with_bytes(block, white)
+
+
+def _with_bytes(block: Block, white: float) -> dict[str, np.ndarray]:
+    """Return a block with its colours as bytes."""
+    return {n: to_uint8(block[n], white) if n in RGB else block[n] for n in block}
+
+
+def _white(header: Any, colors: Float64[np.ndarray, "N 3"]) -> float:
+    """Return the white of a scan: its limit, or that of its values if they are beyond.
+
+    Values of 8 bits under a limit of 16 are of writers that fill in the type's.
+    """
+    found = white_level(colors)
+    with suppress(Exception):  # no limits, or not as the standard has them
+        limits = header["colorLimits"]
+        limit = max(_number(limits[f"{name}Maximum"]) for name in _E57_COLORS)
+        if found <= limit and (found > _BYTE or limit == found):
+            return limit
+    return found
+
+
+def _pose(header: Any, name: str) -> tuple[Float64[np.ndarray, " 4"], Float64[np.ndarray, " 3"]]:
+    """Return the quaternion (wxyz, of any length) and the translation of a scan.
+
+    Either may be missing; children are in any order.
+    """
+    values = {"rotation": [1.0, 0.0, 0.0, 0.0], "translation": [0.0, 0.0, 0.0]}
+    node = header.node
+    if node.isDefined("pose"):
+        for key, axes in (("rotation", "wxyz"), ("translation", "xyz")):
+            if node["pose"].isDefined(key):
+                values[key] = [_number(node["pose"][key][axis]) for axis in axes]
+    quat, shift = (np.array(each, np.float64) for each in values.values())
+    if not (np.isfinite(quat).all() and np.isfinite(shift).all()):
+        label = f"{name}, {node['name'].value()!r}" if node.isDefined("name") else name
+        numbers = ", ".join(f"{x:g}" for x in (*quat, *shift))
+        raise ValueError(f"a pose of {label} that is not finite: {numbers}")
+    return quat / (np.abs(quat).max() or 1.0), shift
+
+
+def _number(node: Any) -> float:
+    return float(node.scaledValue() if hasattr(node, "scaledValue") else node.value())
 
 
 @contextmanager
@@ -179,18 +245,21 @@ def _opened_e57(path: Path) -> Iterator[tuple[Any, list[Any]]]:
             image.close()
 
 
-def _read_scan(image: Any, header: Any, size: int) -> Iterator[dict[str, np.ndarray]]:
+def _read_scan(
+    image: Any, header: Any, pose: tuple[np.ndarray, np.ndarray], size: int
+) -> Iterator[dict[str, np.ndarray]]:
     """Yield the valid points of a scan in the common frame, at most ``size`` at a time."""
     from pye57 import libe57  # noqa: PLC0415  (an optional package)
 
     axes = next((p for p in _AXES if set(p) <= set(header.point_fields)), None)
     if axes is None:
         raise ValueError(f"neither cartesian nor spherical coordinates: {header.point_fields}")
-    count, optional = int(header.point_count), (*_E57_COLORS, "intensity", *_INVALID)
+    count, optional = int(header.point_count), (*_E57_COLORS, "intensity", *_INVALID, _NO_COLOR)
     fields = (*axes, *(name for name in optional if name in header.point_fields))
     room = min(size, max(count, 1))
-    # Colours may be 8-bit, 16-bit or 0 to 1; the white level is detected later.
-    kinds = {name: np.int8 if name in _INVALID else np.float64 for name in fields}
+    # Colours may be 8-bit, 16-bit or 0 to 1.
+    flags = (*_INVALID, _NO_COLOR)
+    kinds = {name: np.int8 if name in flags else np.float64 for name in fields}
     arrays: dict[str, np.ndarray] = {name: np.empty(room, kind) for name, kind in kinds.items()}
     buffers = libe57.VectorSourceDestBuffer()
     for name, array in arrays.items():
@@ -204,16 +273,26 @@ def _read_scan(image: Any, header: Any, size: int) -> Iterator[dict[str, np.ndar
             if name in arrays:
                 valid &= arrays[name][:number] == 0
         data = {name: array[:number][valid] for name, array in arrays.items()}
-        xyz = np.stack([data[name] for name in axes], axis=1)
-        if axes == _SPHERICAL:
-            distance, azimuth, elevation = xyz.T
-            flat, height = distance * np.cos(elevation), distance * np.sin(elevation)
-            xyz = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), height], axis=1)
-        if header.has_pose():
-            xyz = xyz @ np.asarray(header.rotation_matrix, np.float64).T
-            xyz = xyz + np.asarray(header.translation, np.float64)
+        xyz = _placed(np.stack([data[name] for name in axes], axis=1), axes == _SPHERICAL, pose)
+        if _NO_COLOR in data:
+            for name in _E57_COLORS.keys() & data.keys():
+                data[name][data[_NO_COLOR] != 0] = 0.0
         named = {_E57_COLORS.get(name, name): values for name, values in data.items()}
         yield named | dict(zip(XYZ, xyz.T, strict=True))
     reader.close()
     if given < count:
         raise ValueError(f"{given:,} of {count:,} points of a scan")
+
+
+def _placed(
+    xyz: Float64[np.ndarray, "N 3"], is_spherical: bool, pose: tuple[np.ndarray, np.ndarray]
+) -> Float64[np.ndarray, "N 3"]:
+    """Return a scan's positions, possibly range, azimuth and elevation, in the file's frame."""
+    if is_spherical:
+        distance, azimuth, elevation = xyz.T
+        flat, height = distance * np.cos(elevation), distance * np.sin(elevation)
+        xyz = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), height], axis=1)
+    quat, shift = pose
+    if quat.any():
+        xyz = xyz @ rotation_from_quat(quat).T
+    return np.asarray(xyz + shift)

@@ -23,8 +23,9 @@ class VoxelTable(NamedTuple):
 
     keys: UInt64[np.ndarray, " C"]
     mean: Float32[np.ndarray, "C 3"]
-    color: Float32[np.ndarray, "C 3"]
+    color: Float32[np.ndarray, "C 3"]  # mean of the points that have one
     counts: Int32[np.ndarray, " C"]
+    num_colored: Int32[np.ndarray, " C"]
     level: Int16[np.ndarray, " C"]
     slots: Int32[np.ndarray, " S"]
 
@@ -70,11 +71,13 @@ def _lower_footprints(block, m, side, size, footprints):
 def merge_points(start, xyz, rgb, levels, coarsening, voxels, num):
     """Merge points into ``num`` voxels, one after another, from ``start`` on.
 
+    Black points have no colour: scanners store it where they saw none.
+
     Returns the first point that found no free voxel, or the number of points, and the number of
     voxels.
     """
     has_color = len(rgb) == len(xyz)
-    keys, mean, color, counts, level, slots = voxels
+    keys, mean, color, counts, num_colored, level, slots = voxels
     for i in range(start, len(xyz)):
         if levels[i] == OUTSIDE:
             continue
@@ -86,14 +89,17 @@ def merge_points(start, xyz, rgb, levels, coarsening, voxels, num):
                 return i, num
             e = num
             num += 1
-            slots[slot], keys[e], level[e], counts[e] = num, key, levels[i], 0
+            slots[slot], keys[e], level[e], counts[e], num_colored[e] = num, key, levels[i], 0, 0
             for axis in range(3):
                 mean[e, axis] = color[e, axis] = np.float32(0.0)
         counts[e] += 1
         share = 1.0 / counts[e]
         for axis in range(3):  # m <- m + (x - m) / n
             mean[e, axis] += (xyz[i, axis] - mean[e, axis]) * share
-            if has_color:
+        if has_color and max(rgb[i, 0], rgb[i, 1], rgb[i, 2]) > 0:
+            num_colored[e] += 1
+            share = 1.0 / num_colored[e]
+            for axis in range(3):
                 color[e, axis] += (rgb[i, axis] - color[e, axis]) * share
     return len(xyz), num
 
@@ -110,14 +116,18 @@ def merge_voxels(old, num, coarsening, new):
             e = filled
             filled += 1
             new.slots[slot], new.keys[e] = filled, key
-            new.level[e], new.counts[e] = old.level[i], 0
+            new.level[e], new.counts[e], new.num_colored[e] = old.level[i], 0, 0
             for axis in range(3):
                 new.mean[e, axis] = new.color[e, axis] = np.float32(0.0)
         new.counts[e] += old.counts[i]
         share = np.float64(old.counts[i]) / new.counts[e]
         for axis in range(3):
             new.mean[e, axis] += (old.mean[i, axis] - new.mean[e, axis]) * share
-            new.color[e, axis] += (old.color[i, axis] - new.color[e, axis]) * share
+        if old.num_colored[i] > 0:
+            new.num_colored[e] += old.num_colored[i]
+            share = np.float64(old.num_colored[i]) / new.num_colored[e]
+            for axis in range(3):
+                new.color[e, axis] += (old.color[i, axis] - new.color[e, axis]) * share
     return filled
 
 

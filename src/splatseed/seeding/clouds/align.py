@@ -138,8 +138,11 @@ def align_cloud(
     paths: Sequence[Path],
     progress: Progress = silent,
     settings: AlignSettings = ALIGNMENT,
+    columns: Sequence[str] = (),
 ) -> CloudAlignment:
     """Align clouds, all in one frame of any scale, with a scene that has points of its own.
+
+    ``columns`` are those of text files, as of ``open_cloud``.
 
     Raises:
         PointCloudError: The scene or the cloud has too few points, or no alignment is reliable.
@@ -147,7 +150,7 @@ def align_cloud(
         SceneFormatError: A file is damaged.
     """
     tie_points = select_tie_points(scene)
-    offset, xyz, rgb = sample_cloud(paths, progress)
+    offset, xyz, rgb = sample_cloud(paths, progress, columns)
     progress("align", 0.0)
     unit_from_scene, unit_from_cloud = to_unit_size(tie_points.xyz), to_unit_size(xyz)
     unit_points = tie_points.transformed(unit_from_scene)

@@ -68,6 +68,12 @@ class ConsistencySettings:
     """Grey levels by which colours of cloud and photographs may differ, beyond ..."""
     color_factor: float = 4.0
     """... this factor of the median difference."""
+    min_filling: float = 0.05
+    """Fraction of the voxels that have one colour, from which on it may stand for none ..."""
+    filling_difference: int = 16
+    """... if the photographs' differ by more grey levels, beyond ..."""
+    filling_factor: float = 2.0
+    """... this factor of the median difference of the others."""
     min_support: float = 0.05
     repeat_above: float = 0.002
     """Fraction of dropped voxels above which the others are checked again."""
@@ -232,6 +238,7 @@ class ConsistentVoxels(NamedTuple):
 
     kept: Int64[np.ndarray, " K"]  # their rows, rising
     evidence: Evidence  # on them
+    uncolored: Bool[np.ndarray, " K"]  # whether the cloud has no colour of each
     fit: float  # fraction of the scene's points at the cloud's depth, where it has a surface
     num_compared: int  # the number of these points
     num_hidden: int  # voxels that no photograph sees
@@ -270,10 +277,12 @@ def consistent_voxels(
         xyz = voxels.xyz[active]
         surfaces, cell = find_surfaces(views, xyz, progress)
         evidence = find_evidence(views, xyz, surfaces, cell, free, progress)
-        contradicted = np.zeros(len(active), bool)
+        contradicted, uncolored = np.zeros(len(active), bool), np.zeros(len(active), bool)
+        own = None if colors is None else colors[active]
+        if own is not None:
+            uncolored = _uncolored(own, voxels.has_color[active], evidence)
         if clean:
-            own = None if colors is None else colors[active]
-            contradicted, counts = _contradicted(evidence, own)
+            contradicted, counts = _contradicted(evidence, own, ~uncolored)
             dropped.update(counts)
         if last or np.count_nonzero(contradicted) <= CONSISTENCY.repeat_above * len(active):
             break
@@ -287,25 +296,60 @@ def consistent_voxels(
     kept = seen & ~contradicted
     num_hidden = int(np.count_nonzero(~seen & ~contradicted))
     return ConsistentVoxels(
-        active[kept], evidence.select(kept), fit, num_compared, num_hidden, dropped
+        active[kept], evidence.select(kept), uncolored[kept], fit, num_compared, num_hidden, dropped
     )
 
 
+def _uncolored(
+    colors: UInt8[np.ndarray, "N 3"], has_color: Bool[np.ndarray, " N"], evidence: Evidence
+) -> Bool[np.ndarray, " N"]:
+    """Tell of which voxels a cloud has no colour.
+
+    These are black, or have one colour in common that the photographs contradict: some writers fill
+    in white or grey where the scanner saw none.
+    """
+    code = colors.astype(np.int32) @ np.array([1 << 16, 1 << 8, 1], np.int32)
+    codes, counts = np.unique(code[has_color], return_counts=True)
+    uncolored = ~has_color
+    for filling in codes[counts >= CONSISTENCY.min_filling * len(colors)]:
+        filled = has_color & (code == filling)
+        difference, typical = _compare_colors(evidence, colors, has_color & ~filled)
+        known = difference[filled & ~np.isnan(difference)]
+        limit = CONSISTENCY.filling_difference + CONSISTENCY.filling_factor * typical
+        if len(known) and np.median(known) > limit:
+            uncolored |= filled
+    return uncolored
+
+
+def _compare_colors(
+    evidence: Evidence, colors: UInt8[np.ndarray, "N 3"], known: Bool[np.ndarray, " N"]
+) -> tuple[Float64[np.ndarray, " N"], float]:
+    """Return how far colours are from the photographs', and the median of the ``known`` ones.
+
+    NaN where photographs do not tell; the median is infinite if they do nowhere.
+    """
+    difference = np.abs(colors.astype(np.int16) - evidence.rgb).max(axis=1).astype(np.float64)
+    difference[np.isnan(evidence.agreement)] = np.nan
+    typical = difference[known & ~np.isnan(difference)]
+    return difference, float(np.median(typical)) if len(typical) else np.inf
+
+
 def _contradicted(
-    evidence: Evidence, colors: UInt8[np.ndarray, "N 3"] | None
+    evidence: Evidence, colors: UInt8[np.ndarray, "N 3"] | None, colored: Bool[np.ndarray, " N"]
 ) -> tuple[Bool[np.ndarray, " N"], dict[str, int]]:
-    """Tell which voxels are contradicted, and count them by their first reason."""
+    """Tell which voxels are contradicted, and count them by their first reason.
+
+    ``colored`` tells of which the cloud has a colour.
+    """
     s = CONSISTENCY
     violation = evidence.free_space_violation
     # NaN compares false.
     inconsistent = (evidence.num_views >= s.min_views) & (evidence.agreement < s.min_agreement)
     inconsistent &= evidence.confirmations < s.min_confirmations
     other_color = np.zeros_like(violation)
-    known = ~np.isnan(evidence.agreement)
-    if colors is not None and known.any():
-        difference = np.abs(colors.astype(np.int16) - evidence.rgb).max(axis=1)
-        limit = s.color_difference + s.color_factor * np.median(difference[known])
-        other_color = known & (difference > limit)
+    if colors is not None:
+        difference, typical = _compare_colors(evidence, colors, colored)
+        other_color = colored & (difference > s.color_difference + s.color_factor * typical)
     contradicted = np.zeros_like(violation)
     counts = {}
     reasons = {

@@ -1,8 +1,8 @@
 """Colours of points without any, from the photographs that see them.
 
 Some programs write models and clouds without colours: all points are black, white or grey. Points
-*lack colours* if nearly all have the same one. Promise: positions stay, and points of another
-colour keep it.
+*lack colours* if nearly all have the same one, or if many are black: those are. Promise: positions
+stay, and points of another colour keep it.
 """
 
 from __future__ import annotations
@@ -17,16 +17,42 @@ from splatseed.scene import Scene
 from splatseed.seeding.photo_methods import MAX_SIZE, photographed, read_views
 
 _MIN_POINTS = 10  # points of one colour that are no chance
-_ALIKE = 0.99  # share of the points that have the same colour, if they lack colours
+ALIKE = 0.99  # share of the points from which on all lack colours
+_BLACK = 0.25  # share of exactly black points, if they lack colours; dark scenes have up to 0.08
+_LINEAR_AT, _LINEAR_GAIN = 16.0, 0.5
+"""Median difference from the photographs, in grey levels, from which on colours may be linear, and
+the part of it that must be left after they are encoded as sRGB."""
+_LINEAR = np.arange(256) / 255.0
+_SRGB = np.where(_LINEAR <= 0.0031308, 12.92 * _LINEAR, 1.055 * _LINEAR ** (1 / 2.4) - 0.055)
 
 
 def lacks_color(rgb: UInt8[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
-    """Return which points lack a colour: none, or nearly all."""
+    """Return which points lack a colour: none, many that are black, or nearly all."""
     code = rgb.astype(np.int64) @ np.array([1 << 16, 1 << 8, 1])
     codes, counts = np.unique(code, return_counts=True)
-    if len(rgb) < _MIN_POINTS or counts.max() < _ALIKE * len(rgb):
+    if len(rgb) < _MIN_POINTS:
         return np.zeros(len(rgb), np.bool_)
-    return np.asarray(code == codes[counts.argmax()])
+    if counts.max() >= ALIKE * len(rgb):
+        return np.asarray(code == codes[counts.argmax()])
+    black = np.asarray(code == 0)
+    return black if black.mean() >= _BLACK else np.zeros(len(rgb), np.bool_)
+
+
+def encoded_if_linear(
+    rgb: UInt8[np.ndarray, "N 3"], seen: UInt8[np.ndarray, "N 3"], sample: np.ndarray
+) -> UInt8[np.ndarray, "N 3"] | None:
+    """Return colours encoded as sRGB (IEC 61966-2-1), if photographs show that they are linear.
+
+    ``seen`` are the photographs' colours of the rows ``sample``. Returns None if they fit as well
+    as they are.
+    """
+    encoded = np.rint(255.0 * _SRGB).astype(np.uint8)[rgb]
+    before, after = (
+        float(np.median(np.abs(colors[sample].astype(np.int16) - seen)))
+        for colors in (rgb, encoded)
+    )
+    is_linear = before >= _LINEAR_AT and after <= _LINEAR_GAIN * before
+    return np.asarray(encoded) if is_linear else None
 
 
 def missing_color_findings(scene: Scene) -> list[Finding]:

@@ -43,9 +43,10 @@ def read_clouds(
     pixels: float,
     capacity: int,
     progress: Progress,
+    columns: Sequence[str] = (),
 ) -> MergedCloud:
     """Merge clouds, all in one frame, in voxels of so many pixels of the views."""
-    files = tuple(open_cloud(path) for path in paths)
+    files = tuple(open_cloud(path, columns) for path in paths)
     has_color = all(file.colors != "none" for file in files)
     voxels = Voxels(capacity, views, pixels)
     low, high, non_finite = np.full(3, np.inf), np.full(3, -np.inf), 0
@@ -84,13 +85,13 @@ def _finite_chunks(
 
 
 def sample_cloud(
-    paths: Sequence[Path], progress: Progress
+    paths: Sequence[Path], progress: Progress, columns: Sequence[str] = ()
 ) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"] | None]:
     """Sample clouds of one frame evenly.
 
     Returns an offset, the positions minus this offset, and the colours if all files have some.
     """
-    files = [open_cloud(path) for path in paths]
+    files = [open_cloud(path, columns) for path in paths]
     has_color = all(file.colors == "rgb" for file in files)
     voxels, offset = Voxels(MAX_SAMPLE), np.zeros(3)
     for file in files:

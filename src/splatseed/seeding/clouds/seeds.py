@@ -20,14 +20,16 @@ from splatseed.photos.view import View
 from splatseed.photos.visibility import find_visibility
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Note, Progress, silent
+from splatseed.sampling import strided
 from splatseed.scene import Image, Scene
 from splatseed.seeding.clouds.photo_consistency import (
     ConsistentVoxels,
     SurfaceDepths,
+    colors_of_points,
     consistent_voxels,
     free_space,
 )
-from splatseed.seeding.clouds.point_colors import lacks_color
+from splatseed.seeding.clouds.point_colors import ALIKE, encoded_if_linear, lacks_color
 from splatseed.seeding.clouds.reading import MergedCloud, read_clouds
 from splatseed.seeding.clouds.settings import CloudInputs, CloudSettings
 from splatseed.seeding.cover import covered_share
@@ -47,6 +49,7 @@ to 0.92 (room0)."""
 MIN_COMPARED = 50  # points of the scene below which this fraction is not meaningful
 UNKNOWN_CONFIDENCE = 0.5  # of a point that fewer than two photographs see
 LOW_COVERAGE = 0.5  # fraction of the photographs' cells below which a note says so
+LINEAR_SAMPLE = 20_000  # voxels whose colours are compared with the photographs'
 NATIONAL_GRID = 1e5  # coordinates from here on, in metres, are printed in full
 
 
@@ -61,8 +64,9 @@ def cloud_seeds(
     """Make seeds from files, for a scene with cameras."""
     frames = frames_of(scene)
     merged = read_clouds(
-        inputs.paths, inputs.scene_from_cloud, frames, settings.pixels, inputs.capacity, progress
-    )
+        inputs.paths, inputs.scene_from_cloud, frames, settings.pixels, inputs.capacity, progress,
+        settings.columns,
+    )  # fmt: skip
     voxels, images, views = merged.voxels, scene.images, frames
     if not len(voxels) or _is_elsewhere(merged, scene):
         raise _out_of_view(merged, scene)
@@ -73,17 +77,23 @@ def cloud_seeds(
     none = np.empty((0, 3))
     visible = [visibility.of(image) if len(visibility.xyz) else none for image in images]
     has_rgb = _has_rgb(merged)
+    colors = _encoded(merged, views, progress, note) if has_rgb else None
     free = _free_space(scene, images, views, visible, rng, progress) if settings.clean else None
     selected = consistent_voxels(
-        views, visible, voxels, voxels.rgb if has_rgb else None, progress,
-        clean=settings.clean, free=free,
-    )  # fmt: skip
+        views, visible, voxels, colors, progress, clean=settings.clean, free=free
+    )
     xyz = voxels.xyz[selected.kept]
     share = covered_share(frames, xyz, CELL, silent)
     findings = [*_reading_findings(merged), *_check_fit(selected)]
     findings.append(_kept_points(selected, len(voxels)))
     if scene.has_photographs and not has_rgb:
         text = f"The cloud has {_found_colors(merged)}: colours are from the photographs."
+        findings.append(Finding("colors-of-photographs", text, "info"))
+    elif scene.has_photographs and (number := int(selected.uncolored.sum())):
+        text = (
+            f"{number:,} of {len(xyz):,} seeds have no colour in the cloud (black, or one colour "
+        )
+        text += "that the photographs contradict): theirs is from the photographs."
         findings.append(Finding("colors-of-photographs", text, "info"))
     if share < LOW_COVERAGE:
         hint = ": `method='auto'` with `cloud` seeds the rest" if inputs.alone else ""
@@ -92,23 +102,36 @@ def cloud_seeds(
     for finding in findings:
         note(finding)
     agreement = np.nan_to_num(selected.evidence.agreement, nan=UNKNOWN_CONFIDENCE)
-    return PointCloud(xyz, _colors(settings, scene, merged, selected), confidence=agreement)
-
-
-def _colors(
-    settings: CloudSettings, scene: Scene, merged: MergedCloud, selected: ConsistentVoxels
-) -> UInt8[np.ndarray, "K 3"]:
-    """Return the cloud's own colours, or those of the photographs where these are better."""
+    rgb = selected.evidence.rgb
     has_any = all(file.colors != "none" for file in merged.files)
-    if not has_any or (scene.has_photographs and (settings.recolor or not _has_rgb(merged))):
-        return selected.evidence.rgb
-    return np.asarray(merged.voxels.rgb[selected.kept])
+    if has_any and not (scene.has_photographs and (settings.recolor or colors is None)):
+        rgb = (voxels.rgb if colors is None else colors)[selected.kept]
+        if scene.has_photographs:
+            rgb = np.where(selected.uncolored[:, None], selected.evidence.rgb, rgb)
+    return PointCloud(xyz, rgb, confidence=agreement)
+
+
+def _encoded(
+    merged: MergedCloud, views: Sequence[View], progress: Progress, note: Note
+) -> UInt8[np.ndarray, "N 3"]:
+    """Return the cloud's own colours, encoded as the photographs' where the file's are linear."""
+    voxels = merged.voxels
+    if not all(file.may_be_linear for file in merged.files) or not views[0].photograph.size:
+        return voxels.rgb
+    sample = strided(np.flatnonzero(voxels.has_color), LINEAR_SAMPLE)
+    seen = colors_of_points(views, voxels.xyz[sample], progress)
+    encoded = encoded_if_linear(voxels.rgb, seen, sample)
+    if encoded is None:
+        return voxels.rgb
+    text = "The cloud's colours are linear, as the photographs show: they were encoded as sRGB."
+    note(Finding("linear-colors", text, "info"))
+    return encoded
 
 
 def _has_rgb(merged: MergedCloud) -> bool:
     """Whether all files have colours, and not one colour for nearly all points."""
     named = all(file.colors == "rgb" for file in merged.files)
-    return named and not lacks_color(merged.voxels.rgb).any()
+    return bool(named and lacks_color(merged.voxels.rgb).mean() < ALIKE)
 
 
 def _found_colors(merged: MergedCloud) -> str:

@@ -24,6 +24,9 @@ class CloudSettings:
     """Take colours from the photographs even if the cloud has some."""
     clean: bool = True
     """Leave out points that the photographs contradict, and isolated ones."""
+    columns: tuple[str, ...] = ()
+    """Columns of text clouds, such as x y z i r g b; _ skips one. By default the header's, or found
+    from the values."""
     test_every: Annotated[int, Range(2, also=0)] = 0
     """Leave out every n-th image by name, as trainers do for testing (8); 0 = use all."""
 
@@ -48,7 +51,7 @@ class _Memory:
     per_pixel: int = 8
     """For each pixel of the photographs: its colour, its grey level, and stereo's maps."""
     per_voxel: int = 320
-    """Upper bound: 45 in the table, the rest where voxels are checked, thinned and written."""
+    """Upper bound: 49 in the table, the rest where voxels are checked, thinned and written."""
     min_voxels: int = 1 << 16
     max_voxels: int = 1 << 24
 

@@ -3,8 +3,8 @@
 Notation: the *footprint* of a point is the side of a pixel at its depth, smallest over the views in
 whose frames it falls. Its voxel has level L and side 2^(L + s), where 2^L is the greatest power of
 two within the footprint, and s, the *coarsening*, counts how often all voxels were doubled. A voxel
-holds the mean position and colour of its points, and their number. Without views all voxels have
-one side.
+holds the mean position of its points, their number, and the mean colour of those that are not
+black, as scanners store where they saw none. Without views all voxels have one side.
 Promise: the result depends on the points and their order, neither on how they were cut into chunks
 nor on the number of threads. Points in no frame are counted and dropped. When ``capacity`` voxels
 are filled, all are merged with their neighbours into voxels of twice the side.
@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, UInt8
+from jaxtyping import Bool, Float32, Float64, Int32, UInt8
 
 from splatseed.photos.view import View
 from splatseed.seeding.clouds._kernels import (
@@ -34,9 +34,10 @@ MIN_EXTENT = 1e-6
 def _empty_table(capacity: int) -> VoxelTable:
     """Return an empty table; pages that are not written take no memory."""
     mean, color = np.empty((capacity, 3), np.float32), np.empty((capacity, 3), np.float32)
-    counts, level = np.empty(capacity, np.int32), np.empty(capacity, np.int16)
+    counts, num_colored = np.empty(capacity, np.int32), np.empty(capacity, np.int32)
+    level = np.empty(capacity, np.int16)
     slots = np.zeros(1 << (2 * capacity - 1).bit_length(), np.int32)
-    return VoxelTable(np.empty(capacity, np.uint64), mean, color, counts, level, slots)
+    return VoxelTable(np.empty(capacity, np.uint64), mean, color, counts, num_colored, level, slots)
 
 
 class Voxels:
@@ -75,8 +76,13 @@ class Voxels:
 
     @property
     def rgb(self) -> UInt8[np.ndarray, "N 3"]:
-        """Mean colours."""
+        """Mean colours of the points that have one; black without any."""
         return np.asarray(np.rint(self._table.color[: self._num]).astype(np.uint8))
+
+    @property
+    def has_color(self) -> Bool[np.ndarray, " N"]:
+        """Whether any point of a voxel has a colour."""
+        return np.asarray(self._table.num_colored[: self._num] > 0)
 
     @property
     def count(self) -> Int32[np.ndarray, " N"]:
