@@ -107,6 +107,10 @@ class EvaluateRequest:
     default the run's, else the folder masks beside the photographs. Transparent pixels are empty
     space around an object that is cut out, and do not count elsewhere; none: always empty, alpha:
     never."""
+    background: Annotated[str | None, tyro.conf.arg(metavar="black|white|R,G,B")] = None
+    """The background of renders, over which transparent pixels of photographs are composited, too;
+    by default what the trainer recorded beside the model (graphdeco's cfg_args, nerfstudio's
+    config.yml), else black."""
     lpips_weights: Path | None = None
     """The file of VGG's weights for LPIPS, or its folder; by default PyTorch's cache."""
     backend: Backend = "auto"
