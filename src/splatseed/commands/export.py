@@ -116,9 +116,6 @@ def run(arguments: list[str]) -> None:
         text = "The axes of the .spz were read as right, up, back, as specified."
         fix = "If the result is upside down, they had not been converted (docs/models.md)."
         findings.append(Finding("spz-axes", text, "info", fix=fix))
-    if name == "splat" and gaussians.shN.size:
-        text = "A .splat has no view-dependent colour: the model's is left out."
-        findings.append(Finding("unused-harmonics", text))
     print_note(*findings)
     if page:
         link = visible(target.resolve().as_uri())

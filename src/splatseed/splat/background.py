@@ -10,6 +10,7 @@ trainers record theirs beside the model: graphdeco's and its relatives ``white_b
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -69,14 +70,28 @@ def recorded_background(model: Path) -> Background | None:
 
     None if there is no record, or the background was random, so that any is right.
     """
+    found = recorded(model, _RECORDS)
+    return None if found is None else Background(_COLORS[found[0].lower()], found[1])
+
+
+def recorded(model: Path, patterns: Mapping[str, Sequence[str]]) -> tuple[str, Path] | None:
+    """Find what a trainer recorded in the model's folder or up to three above.
+
+    Args:
+        model: The file of the model.
+        patterns: Expressions with one group, by the name of the file; the first match decides.
+
+    Returns:
+        The group, and the file.
+    """
     for folder in model.resolve().parents[:4]:
-        for name, patterns in _RECORDS.items():
+        for name, expressions in patterns.items():
             content = ""
             with suppress(OSError, SplatseedError, UnicodeDecodeError):
                 content = read_text(folder / name)
-            for pattern in patterns:
-                if found := re.search(pattern, content, re.IGNORECASE | re.MULTILINE):
-                    return Background(_COLORS[found[1].lower()], folder / name)
+            for expression in expressions:
+                if found := re.search(expression, content, re.IGNORECASE | re.MULTILINE):
+                    return found[1], folder / name
     return None
 
 

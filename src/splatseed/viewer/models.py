@@ -28,7 +28,7 @@ from splatseed.progress import Note, silent_note
 from splatseed.scene import BLACK, Color, Scene
 from splatseed.similarity import Similarity
 from splatseed.splat.background import background_of
-from splatseed.splat.formats import holds_gaussians, read_gaussians
+from splatseed.splat.formats import holds_gaussians, read_gaussians, unpacked_model
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.model_frame import move_to_scene_origin, scene_from_model, transform_gaussians
 from splatseed.splat.training_frame import TrainingFrame, frame_of_model
@@ -100,6 +100,7 @@ def open_item(path: StrPath, scene_path: Path | None = None) -> ViewerItem:
 
     folder, findings = RunFolder(path), list[Finding]()
     if not path.is_dir() or not folder.is_run:
+        path = unpacked_model(path) or path
         if path.is_file() and holds_gaussians(path):
             gaussians, scene = read_gaussians(path, findings.append), scene_at(scene_path)
             moved, background = None, background_of(path, note=findings.append) or BLACK
