@@ -37,7 +37,7 @@ class Options:
 
     model: Annotated[Path, tyro.conf.Positional]
     """A run folder of splatseed train, or a file of Gaussians from any trainer: .ply, .spz, .sog,
-    .splat."""
+    .splat, .glb, or a checkpoint of gsplat, nerfstudio or graphdeco."""
     scene: Path | None = None
     """The scene the model belongs to, in the same world; a run knows its own."""
     request: Annotated[EvaluateRequest, tyro.conf.arg(name="")] = AS_TRAINED
