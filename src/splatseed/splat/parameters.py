@@ -41,6 +41,7 @@ _ROUNDING = 1e-3  # activated opacities may leave 0 to 1 by this
 _LARGEST_LOGIT = 30.0
 """Logits of a trainer stay below it: in float32, opacities are 1 from about 17 on."""
 _MIN_COUNT = 20  # of Gaussians whose values show their unit
+_VISIBLE = 0.3  # the largest opacity of a model that shows anything is above it
 _MIN_RANGE = 0.7  # of opacities of a trained model, between 0 and 1
 _MAX_ZEROS = 0.01  # share of activated opacities that are exactly 0, which a sigmoid never gives
 _SAMPLE = 2000  # Gaussians whose spacing is measured
@@ -113,8 +114,10 @@ def _are_activated(path: Path, opacities: Float32[np.ndarray, " N"]) -> bool:
         if len(values) >= _MIN_COUNT and np.isfinite(high) and high > _LARGEST_LOGIT:
             raise _uncertain(path, f"opacities from {low:.3g} to {high:.3g}", "their logits")
         return False  # such as a model without its faint Gaussians
-    if len(values) < _MIN_COUNT or high == 0:  # logit 0: opacity 1/2, as some trainers start
-        return False
+    if len(values) < _MIN_COUNT or high < _VISIBLE:
+        return (
+            False  # logits near 0, opacities of 1/2, as some trainers start: else none would show
+        )
     if high - low < _MIN_RANGE or (values == 0).mean() > _MAX_ZEROS:
         found = f"opacities from {low:.3g} to {high:.3g}, which may be logits or not"
         raise _uncertain(path, found, "logits, log(o / (1 - o)), of which some are negative")
