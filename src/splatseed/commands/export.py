@@ -15,6 +15,8 @@ from splatseed.findings import Finding
 from splatseed.io.origin import RECENTER, choose_origin, format_offset, offset_beside, write_offset
 from splatseed.progress import Note, Progress
 from splatseed.requirements import require
+from splatseed.scene import BLACK
+from splatseed.splat.background import background_of, name_background
 from splatseed.splat.formats import (
     FORMATS,
     filter_gaussians,
@@ -172,4 +174,7 @@ def _scoring_command(options: Options) -> str:
         words += ["--test-every", str(every)]
     if config.get("masks") is not None and options.clean in {None, OWN}:
         words += ["--masks", quoted(config["masks"])]
+    background = None if config else background_of(model_file(options.model))
+    if background is not None and background != BLACK:
+        words += ["--background", name_background(background)]
     return " ".join(words)
