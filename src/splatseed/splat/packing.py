@@ -86,7 +86,7 @@ class PackingSettings:
     max_blur: float = 0.5  # cost of a misplaced Gaussian, relative to a lost one
     visible: float = 1 / 64  # difference of a coefficient: about one of 255 steps of a colour
     coarse_error: float = 0.1  # RMS rounding error of a position, in sizes, that may show
-    coarse_share: float = 0.05  # of Gaussians of such errors, that the user should know of
+    coarse_share: float = 0.25  # of such Gaussians, that is said: a few far ones do not show
     morton_bits: int = 21  # per axis; 63 in all
 
 
