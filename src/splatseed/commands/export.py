@@ -43,7 +43,7 @@ class Options:
 
     model: Annotated[Path, tyro.conf.Positional]
     """A run folder of splatseed train, or a file of Gaussians: .ply, .compressed.ply, .splat, .spz,
-    .sog."""
+    .sog, .glb, or a checkpoint of gsplat, nerfstudio or graphdeco."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The file to write; its suffix chooses the format: .ply, .splat, .spz, .sog, or .html, a page
     with viewer and model that browsers open from disk."""

@@ -208,12 +208,15 @@ def best_fit(gaussians: Gaussians, fits: Sequence[Fit]) -> tuple[int, float, int
     return best, lost, int(np.count_nonzero(errors > PACKING.coarse_error))
 
 
-def coarse_findings(suffix: str, coarse: int, kept: int, steps: str = "") -> list[Finding]:
+def coarse_findings(
+    suffix: str, coarse: int, kept: Bool[np.ndarray, " N"], steps: str = ""
+) -> list[Finding]:
     """Report positions that are rounded coarsely, if they are more than a few."""
-    if coarse <= PACKING.coarse_share * kept:
+    number = int(np.count_nonzero(kept))
+    if coarse <= PACKING.coarse_share * number:
         return []
     text = f"A {suffix} holds positions {steps}too coarsely for this model: those of "
-    text += f"{counted(coarse, 'Gaussian')} of {kept:,} are rounded by more than a tenth of "
+    text += f"{counted(coarse, 'Gaussian')} of {number:,} are rounded by more than a tenth of "
     text += "their size."
     fix = "Export another format, or move the model to the origin."
     return [Finding("coarse-positions", text, fix=fix)]

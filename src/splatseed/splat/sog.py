@@ -148,7 +148,7 @@ def _within_steps(gaussians: Gaussians, note: Note) -> Gaussians:
     if not kept.all():
         nearest = np.abs(gaussians.means[~kept]).max(axis=1).min()
         note(left_out_finding(".sog", kept, f"{nearest:,.4g} units or more from the origin"))
-    for finding in coarse_findings(".sog", coarse, np.count_nonzero(kept)):
+    for finding in coarse_findings(".sog", coarse, kept):
         note(finding)
     return gaussians if kept.all() else gaussians.select(kept)
 

@@ -140,7 +140,7 @@ def _fixed_point(gaussians: Gaussians, note: Note) -> tuple[Gaussians, int]:
     if not kept.all():
         note(left_out_finding(".spz", kept, f"more than {limit:,.4g} units from the origin"))
     steps = f"up to {limit:,.4g} units from the origin in steps of {2.0**-bits:.3g}, "
-    findings = coarse_findings(".spz", coarse, np.count_nonzero(kept), steps)
+    findings = coarse_findings(".spz", coarse, kept, steps)
     kept_ones = gaussians if kept.all() else gaussians.select(kept)
     findings += clipped_findings(
         ".spz", kept_ones, sizes=_LOG_SCALES, first=_FIRST, further=_FURTHER
