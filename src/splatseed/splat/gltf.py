@@ -67,7 +67,8 @@ def decode(path: Path, note: Note = silent_note) -> Gaussians:
         fix = "If it is upside down, they had not been converted (docs/models.md)."
         note(Finding("gltf-axes", text, "info", fix=fix))
         arrays["means"] = arrays["means"] * signs.position
-        arrays["quats"] = arrays["quats"] * signs.quat
+        w, x, y, z = arrays["quats"].T
+        arrays["quats"] = np.stack([-z, -y, x, w], axis=1)  # turned by 180 degrees about z
         arrays["shN"] = arrays["shN"] * signs.sh[:rest, None]
         return Gaussians(**arrays)
 
