@@ -15,6 +15,8 @@ from splatseed.findings import Finding
 from splatseed.io.origin import RECENTER, choose_origin, format_offset, offset_beside, write_offset
 from splatseed.progress import Note, Progress
 from splatseed.requirements import require
+from splatseed.scene import BLACK
+from splatseed.splat.background import background_of, name_background
 from splatseed.splat.formats import (
     FORMATS,
     filter_gaussians,
@@ -41,7 +43,7 @@ class Options:
 
     model: Annotated[Path, tyro.conf.Positional]
     """A run folder of splatseed train, or a file of Gaussians: .ply, .compressed.ply, .splat, .spz,
-    .sog."""
+    .sog, .glb, or a checkpoint of gsplat, nerfstudio or graphdeco."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The file to write; its suffix chooses the format: .ply, .splat, .spz, .sog, or .html, a page
     with viewer and model that browsers open from disk."""
@@ -116,9 +118,6 @@ def run(arguments: list[str]) -> None:
         text = "The axes of the .spz were read as right, up, back, as specified."
         fix = "If the result is upside down, they had not been converted (docs/models.md)."
         findings.append(Finding("spz-axes", text, "info", fix=fix))
-    if name == "splat" and gaussians.shN.size:
-        text = "A .splat has no view-dependent colour: the model's is left out."
-        findings.append(Finding("unused-harmonics", text))
     print_note(*findings)
     if page:
         link = visible(target.resolve().as_uri())
@@ -175,4 +174,7 @@ def _scoring_command(options: Options) -> str:
         words += ["--test-every", str(every)]
     if config.get("masks") is not None and options.clean in {None, OWN}:
         words += ["--masks", quoted(config["masks"])]
+    background = None if config else background_of(model_file(options.model))
+    if background is not None and background != BLACK:
+        words += ["--background", name_background(background)]
     return " ".join(words)

@@ -139,11 +139,14 @@ def run(arguments: list[str]) -> None:
         models = [path.cropped(i.model, flight.world) if path else i.model for i in items]
         clock("prepare", 0.0)
         device, frame = pick_device(options.backend, clock), viewer_frame(items[0])
-        renderers = [ModelRenderer(model, frame, device) for model in models]
+        crop = path.crop if path else None
+        renderers = [
+            ModelRenderer(model, frame, device, crop.background if crop else item.background)
+            for model, item in zip(models, items, strict=True)
+        ]
         frames = videos.flight_frames(
-            renderers, [item.name for item in items], views, depth=options.depth,
-            background=path.crop.background if path and path.crop else None, progress=clock,
-        )  # fmt: skip
+            renderers, [item.name for item in items], views, depth=options.depth, progress=clock
+        )
         shown = list[float]()
 
         def pictures() -> Iterator[np.ndarray]:

@@ -27,6 +27,7 @@ from splatseed.photos.view import View
 from splatseed.photos.visibility import points_in_image
 from splatseed.projection import camera_centers
 from splatseed.sampling import evenly_spaced
+from splatseed.scene import Color
 from splatseed.similarity import Similarity
 from splatseed.splat.gaussians import Gaussians
 from splatseed.text import agreeing, counted
@@ -63,7 +64,7 @@ class CropBox:
     center: Float64[np.ndarray, " 3"]
     sides: Float64[np.ndarray, " 3"]  # whole lengths
     rotation: Float64[np.ndarray, "3 3"]  # world_from_box
-    background: Float64[np.ndarray, " 3"]  # colour of empty pixels, 0 to 1
+    background: Color  # of empty pixels
 
     def contains(self, xyz: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
         """Whether positions in the path's world are inside."""
@@ -249,9 +250,10 @@ def _crop(crop: Mapping[str, Any]) -> CropBox:
         for each in (crop["crop_center"], crop["crop_scale"], turn)
     )
     colour = crop.get("crop_bg_color") or dict.fromkeys("rgb", 0)
-    background = np.array([colour[channel] for channel in "rgb"], np.float64) / 255
+    background = np.array([colour[channel] for channel in "rgb"], np.float64)
     numbers = np.concatenate([center, sides, angles, background])
     if not np.isfinite(numbers).all() or not (sides > 0).all():
         raise ValueError(f"a crop box of {sides.tolist()} at {center.tolist()}")
     rotation = Rotation.from_euler("xyz", angles).as_matrix()  # yaw @ pitch @ roll
-    return CropBox(center, sides, rotation, np.clip(background, 0, 1))
+    red, green, blue = np.clip(np.rint(background), 0, 255).astype(int).tolist()
+    return CropBox(center, sides, rotation, (red, green, blue))

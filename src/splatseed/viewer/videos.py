@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import UInt8
 from PIL import Image
 
 from splatseed.errors import OutputError
@@ -54,13 +54,9 @@ def flight_frames(
     path: Sequence[View],
     *,
     depth: bool = False,
-    background: Float64[np.ndarray, " 3"] | None = None,
     progress: Progress = silent,
 ) -> Iterator[Frame]:
-    """Render the views of a path, of a model or of two side by side with their names.
-
-    ``background``: the colour of empty pixels, by default black.
-    """
+    """Render the views of a path, of a model or of two side by side with their names."""
     if depth:
         sample = path[:: max(1, len(path) // DEPTH_SAMPLES)]
         near = [nearness(renderers[0].depth(view)).ravel() for view in sample]
@@ -73,9 +69,7 @@ def flight_frames(
                 pictures.append(depth_picture(depths, limits))
                 shown.append(float((depths > 0).mean()))
                 continue
-            image, alpha = renderer.premultiplied(view)
-            if background is not None:
-                image += (1 - alpha) * background.astype(np.float32)
+            image, alpha = renderer.image_and_alpha(view)
             pictures.append(to_uint8(image))
             shown.append(float(alpha.mean()))
         picture = pictures[0]
