@@ -66,13 +66,14 @@ def match_views(
 def checked_once(folder: Path, check: Callable[..., Any], *, of_points: bool) -> Callable[..., Any]:
     """Return a check of a scene that finds the same for all scenes of the same content.
 
-    Errors are not kept, nor what names a scene's folder. Scenes with masks are always checked.
+    Errors are not kept, nor what names a scene's folder; scenes with masks are checked anew.
     """
 
     def found(
         scene: Scene, images: Sequence[Image], progress: Progress = silent, *others: Any
     ) -> Any:
-        if scene.masks is not None or not all(image.has_photograph for image in images):
+        masked = scene.masks is not None and scene.masks.files
+        if masked or not all(image.has_photograph for image in images):
             return check(scene, images, progress, *others)
         key = _digest_of_scene(scene, images, check.__qualname__, others, of_points=of_points)
         result = _once(folder, key, lambda: check(scene, images, progress, *others))
@@ -108,7 +109,7 @@ def _digest(views: Sequence[View], *others: Any) -> bytes:
 
 
 def _digest_of_scene(scene: Scene, images: Sequence[Image], *others: Any, of_points: bool) -> bytes:
-    content = hashlib.sha256(repr((*others, scene.white)).encode())
+    content = hashlib.sha256(repr((*others, scene.white, scene.masks)).encode())
     arrays = []
     for image in images:
         content.update(repr((image.name, image.image_id, image.intrinsics)).encode())

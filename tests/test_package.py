@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import importlib
 import inspect
-import pkgutil
 import re
 import subprocess
 import sys
@@ -25,7 +24,6 @@ from splatseed.requirements import EXTRAS, install_command, require
 
 ROOT = Path(__file__).parents[1]
 SOURCE = Path(splatseed.__file__).parent
-MODULES = ["splatseed"] + [m.name for m in pkgutil.walk_packages(splatseed.__path__, "splatseed.")]
 
 ORDER = (
     "errors", "text", "settings", "requirements", "findings", "progress", "frozen", "sampling",
@@ -287,16 +285,16 @@ def _run_on_loading(node):
             yield from _run_on_loading(each)
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_public_names_are_explained(name):
+def test_public_names_are_explained():
     """Only packages list names; in a module, what has no underscore is for others."""
-    module = importlib.import_module(name)
-    assert module.__doc__
-    assert hasattr(module, "__path__") or "__all__" not in vars(module)
-    for each in getattr(module, "__all__", []):
-        assert hasattr(module, each)
-    for each in _own_public(module):
-        _assert_explained(getattr(module, each), f"{name}.{each}")
+    for name in _paths():
+        module = importlib.import_module(name)
+        assert module.__doc__, name
+        assert hasattr(module, "__path__") or "__all__" not in vars(module), name
+        for each in getattr(module, "__all__", []):
+            assert hasattr(module, each), f"{name}.{each}"
+        for each in _own_public(module):
+            _assert_explained(getattr(module, each), f"{name}.{each}")
 
 
 def _own_public(module):
