@@ -21,7 +21,7 @@ from splatseed.depth.stereo.maps import StereoResult
 from splatseed.io.staging import atomic_file
 from splatseed.photos.view import View
 from splatseed.progress import Progress, silent
-from splatseed.scene import Image, Scene
+from splatseed.scene import Image, Masks, Scene
 
 USERS = (coarse, pipeline, poses)
 """The modules that compare photographs."""
@@ -66,14 +66,13 @@ def match_views(
 def checked_once(folder: Path, check: Callable[..., Any], *, of_points: bool) -> Callable[..., Any]:
     """Return a check of a scene that finds the same for all scenes of the same content.
 
-    Errors are not kept, nor what names a scene's folder; scenes with masks are checked anew.
+    Errors are not kept, nor what names a scene's folder.
     """
 
     def found(
         scene: Scene, images: Sequence[Image], progress: Progress = silent, *others: Any
     ) -> Any:
-        masked = scene.masks is not None and scene.masks.files
-        if masked or not all(image.has_photograph for image in images):
+        if not all(image.has_photograph for image in images):
             return check(scene, images, progress, *others)
         key = _digest_of_scene(scene, images, check.__qualname__, others, of_points=of_points)
         result = _once(folder, key, lambda: check(scene, images, progress, *others))
@@ -109,11 +108,13 @@ def _digest(views: Sequence[View], *others: Any) -> bytes:
 
 
 def _digest_of_scene(scene: Scene, images: Sequence[Image], *others: Any, of_points: bool) -> bytes:
-    content = hashlib.sha256(repr((*others, scene.white, scene.masks)).encode())
-    arrays = []
+    masks = scene.masks or Masks({})
+    files, settings = masks.files, (scene.white, scene.masks is None, masks.inverted, masks.alpha)
+    content, arrays = hashlib.sha256(repr((*others, *settings)).encode()), []
     for image in images:
         content.update(repr((image.name, image.image_id, image.intrinsics)).encode())
-        content.update(hashlib.sha256(image.path.read_bytes()).digest())
+        for path in filter(Path.is_file, (image.path, files.get(image.name, image.path))):
+            content.update(hashlib.sha256(path.read_bytes()).digest())
         arrays += [image.quat, image.translation]
     if of_points:
         arrays += [scene.points.xyz, scene.points.rgb, scene.points.source]
