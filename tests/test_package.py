@@ -188,7 +188,7 @@ def test_help_does_not_wait_for_what_computes():
 
 def test_files_import_each_other_in_no_circle():
     """Also within functions, for type checkers alone, and in lists of lazy names (.pyi)."""
-    paths, imports = _paths(), {}
+    paths, imports = module_paths(), {}
     for name, path in paths.items():
         parts = path.relative_to(SOURCE).with_suffix("").parts
         found = _imported_files(path, name, paths) - DELEGATING.get(".".join(parts), set())
@@ -244,7 +244,7 @@ def test_imports_close_no_circle():
     for the packages it is in itself, which Python has begun before: it may ask nothing of them.
     """
     waits = {}
-    paths = _paths()
+    paths = module_paths()
     for name, path in paths.items():
         wanted = set(_imported_on_loading(path, paths))
         assert not wanted & _packages_above(name), f"{name} imports a package that it is in"
@@ -253,7 +253,7 @@ def test_imports_close_no_circle():
     TopologicalSorter(waits).prepare()  # raises CycleError, which names the circle
 
 
-def _paths():
+def module_paths():
     """Our modules' files by their names."""
     parts = {path: path.relative_to(SOURCE.parent).with_suffix("").parts for path in _files(".")}
     return {".".join(p[:-1] if p[-1] == "__init__" else p): path for path, p in parts.items()}
@@ -287,7 +287,7 @@ def _run_on_loading(node):
 
 def test_public_names_are_explained():
     """Only packages list names; in a module, what has no underscore is for others."""
-    for name in _paths():
+    for name in module_paths():
         module = importlib.import_module(name)
         assert module.__doc__, name
         assert hasattr(module, "__path__") or "__all__" not in vars(module), name
