@@ -1,28 +1,40 @@
-"""Stereo of the same photographs, found once for all tests and processes of the suite.
+"""Stereo and check-ups of the same captures, found once for all tests and processes of the suite.
 
-Most tests of commands, runs and benchmarks look at one room, which takes seconds to compare.
+Most tests of commands, runs and benchmarks look at one room, which takes seconds to compare, and
+half a second to hold against its points.
 """
 
 from __future__ import annotations
 
 import hashlib
 import pickle
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from splatseed.checkup import poses
+import numpy as np
+
+from splatseed.checkup import examination, pose_accuracy, poses, wrong_poses
 from splatseed.depth.stereo import coarse, matching, pipeline
 from splatseed.depth.stereo.maps import StereoResult
 from splatseed.io.staging import atomic_file
 from splatseed.photos.view import View
-from splatseed.progress import Progress
+from splatseed.progress import Progress, silent
+from splatseed.scene import Image, Masks, Scene
 
 USERS = (coarse, pipeline, poses)
 """The modules that compare photographs."""
 
-_found: dict[bytes, StereoResult] = {}
+CHECKS_OF_POSES = (
+    (poses, "check_poses"),
+    (examination, "check_poses"),
+    (pose_accuracy, "estimate_pose_error"),
+)
+CHECKS_OF_POINTS = (examination, "examine"), (wrong_poses, "find_wrong_poses")
+"""Functions of a scene, some of its images, the progress and others, as modules know them."""
+
+_found: dict[bytes, Any] = {}
 
 
 def match_views(
@@ -40,19 +52,48 @@ def match_views(
     """
     matching.check_stereo_memory(views, settings)
     key = _digest(views, priors, sources, settings, seed)
+
+    def match() -> StereoResult:
+        found = matching.match_views(views, priors, sources, settings, seed, progress)
+        return replace(found, views=())
+
+    found, lists = _once(folder, key, match), ("planes", "costs", "agreeing")
+    progress("compare photographs", 1.0)
+    copies = {name: [each.copy() for each in getattr(found, name)] for name in lists}
+    return replace(found, views=tuple(views), **copies)
+
+
+def checked_once(folder: Path, check: Callable[..., Any], *, of_points: bool) -> Callable[..., Any]:
+    """Return a check of a scene that finds the same for all scenes of the same content.
+
+    Errors are not kept, nor what names a scene's folder.
+    """
+
+    def found(
+        scene: Scene, images: Sequence[Image], progress: Progress = silent, *others: Any
+    ) -> Any:
+        if not all(image.has_photograph for image in images):
+            return check(scene, images, progress, *others)
+        key = _digest_of_scene(scene, images, check.__qualname__, others, of_points=of_points)
+        result = _once(folder, key, lambda: check(scene, images, progress, *others))
+        if scene.source.root and str(scene.source.root) in repr(result):
+            del _found[key]
+            (folder / key.hex()).unlink(missing_ok=True)
+        progress("check points", 1.0)
+        return result
+
+    return found
+
+
+def _once(folder: Path, key: bytes, make: Callable[[], Any]) -> Any:
     kept = folder / key.hex()
     if key not in _found and kept.is_file():
         _found[key] = pickle.loads(kept.read_bytes())  # noqa: S301  (our own)
-    if key in _found:
-        progress("compare photographs", 1.0)
-    else:
-        found = matching.match_views(views, priors, sources, settings, seed, progress)
-        _found[key] = replace(found, views=())
+    elif key not in _found:
+        _found[key] = make()
         with atomic_file(kept) as partial:
             partial.write_bytes(pickle.dumps(_found[key]))
-    found, lists = _found[key], ("planes", "costs", "agreeing")
-    copies = {name: [each.copy() for each in getattr(found, name)] for name in lists}
-    return replace(found, views=tuple(views), **copies)
+    return _found[key]
 
 
 def _digest(views: Sequence[View], *others: Any) -> bytes:
@@ -63,4 +104,23 @@ def _digest(views: Sequence[View], *others: Any) -> bytes:
         shape = view.photograph.shape, view.name, view.near
         for each in (repr(shape).encode(), view.photograph.tobytes(), mask, placed):
             content.update(hashlib.sha256(each).digest())
+    return content.digest()
+
+
+def _digest_of_scene(scene: Scene, images: Sequence[Image], *others: Any, of_points: bool) -> bytes:
+    masks = scene.masks or Masks({})
+    files, settings = masks.files, (scene.white, scene.masks is None, masks.inverted, masks.alpha)
+    content, arrays = hashlib.sha256(repr((*others, *settings)).encode()), []
+    for image in images:
+        content.update(repr((image.name, image.image_id, image.intrinsics)).encode())
+        for path in filter(Path.is_file, (image.path, files.get(image.name, image.path))):
+            content.update(hashlib.sha256(path.read_bytes()).digest())
+        arrays += [image.quat, image.translation]
+    if of_points:
+        arrays += [scene.points.xyz, scene.points.rgb, scene.points.source]
+        if scene.tracks is not None:
+            arrays += vars(scene.tracks).values()
+    for array in arrays:
+        content.update(repr(array.shape).encode())
+        content.update(np.ascontiguousarray(array).tobytes())
     return content.digest()

@@ -65,6 +65,26 @@ def compare_anew():
 
 
 @pytest.fixture
+def check_anew():
+    """For tests of the check-up."""
+
+
+@pytest.fixture(autouse=True)
+def _captures_are_checked_once(request, monkeypatch, common):
+    """Holding a capture's parts against each other takes half a second, before all that is made."""
+    if "splatseed.checkup.examination" not in sys.modules or "check_anew" in request.fixturenames:
+        return
+    from .compared_once import CHECKS_OF_POINTS, CHECKS_OF_POSES, checked_once
+
+    folder = common / "checked"
+    folder.mkdir(exist_ok=True)
+    for module, name in (*CHECKS_OF_POSES, *CHECKS_OF_POINTS):
+        of_points = (module, name) in CHECKS_OF_POINTS
+        check = checked_once(folder, getattr(module, name), of_points=of_points)
+        monkeypatch.setattr(module, name, check)
+
+
+@pytest.fixture
 def draw_curves():
     """For tests of the picture of a run's curves: each run draws its own."""
 

@@ -22,6 +22,16 @@ def read_only(values: Any, dtype: Any = None) -> np.ndarray:
     return array
 
 
+def read_only_view(array: np.ndarray) -> np.ndarray:
+    """Return a read-only view of an array that may be writable.
+
+    Numba takes read-only arrays for another type: a kernel that is given both compiles twice.
+    """
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
 def _is_frozen(array: np.ndarray) -> bool:
     """Whether neither the array nor any owner of its memory is writable."""
     owner: Any = array

@@ -9,3 +9,8 @@ import pytest
 def room(sixteen_views):
     """16 photographs of 160 x 120 of the room, read from disk."""
     return sixteen_views[1]
+
+
+@pytest.fixture(autouse=True)
+def _check_anew(check_anew):
+    """The check-up is the subject."""

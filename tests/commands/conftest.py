@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 import shutil
 from collections.abc import Callable
@@ -14,38 +13,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from splatseed.camera import quat_from_rotation
-from splatseed.checkup import pose_accuracy, poses
 from splatseed.io import load_scene, write_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
-
-_compared: dict[object, object] = {}
-
-
-def _once(compare: Callable[..., object]) -> Callable[..., object]:
-    """``compare(scene, images, ...)``, found once for the same photographs at the same poses."""
-
-    def found(scene, images, *progress):
-        folder = scene.source.image_dir
-        paths = [] if folder is None else [folder / image.name for image in images]
-        if scene.masks is not None or not paths or not all(path.is_file() for path in paths):
-            return compare(scene, images, *progress)
-        placed = b"".join(image.camera.cam_from_world.tobytes() for image in images)
-        lenses = tuple(image.intrinsics for image in images)
-        photographs = hashlib.sha256(b"".join(path.read_bytes() for path in paths)).digest()
-        key = compare, placed, lenses, photographs
-        if key not in _compared:
-            _compared[key] = compare(scene, images, *progress)
-        return _compared[key]
-
-    return found
-
-
-@pytest.fixture(autouse=True)
-def _poses_are_checked_once(monkeypatch):
-    """Most commands look at one room, again and again, whose poses take a second to check."""
-    for module, name in ((poses, "check_poses"), (pose_accuracy, "estimate_pose_error")):
-        monkeypatch.setattr(module, name, _once(getattr(module, name)))
 
 
 @pytest.fixture(autouse=True)

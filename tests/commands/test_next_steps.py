@@ -70,8 +70,7 @@ def test_what_info_advises_works(points, bent, tmp_path, monkeypatch, splatseed)
     assert points or len(load_scene("OUT").points) > 500
 
 
-@pytest.mark.parametrize("points", [True, False])
-@pytest.mark.parametrize("trainer", ["gsplat", "nerfstudio"])
+@pytest.mark.parametrize(("trainer", "points"), [("gsplat", True), ("nerfstudio", False)])
 def test_the_advice_is_for_the_trainer_that_is_named(
     points, trainer, room, tmp_path, monkeypatch, splatseed
 ):

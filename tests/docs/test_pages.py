@@ -19,7 +19,7 @@ from splatseed.commands.upsample import full_options
 from splatseed.errors import SceneNotFoundError
 
 from ..command_line import options_of
-from ..test_package import MODULES
+from ..test_package import module_paths
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -122,16 +122,11 @@ def test_links_lead_somewhere(page):
         assert not anchor or anchor in _anchors(other), target
 
 
-def _with_examples():
-    """The modules whose text has any; tests/test_package.py imports the others."""
-    for name in MODULES:
-        path = ROOT.joinpath("src", *name.split("."))
-        path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
-        if ">>> " in path.read_text("utf-8"):
-            yield name
+EXAMPLES = [name for name, path in module_paths().items() if ">>> " in path.read_text("utf-8")]
+"""The modules whose text has any; tests/test_package.py imports the others."""
 
 
-@pytest.mark.parametrize("name", list(_with_examples()))
+@pytest.mark.parametrize("name", EXAMPLES)
 def test_docstrings_examples_give_what_they_say(name):
     result = doctest.testmod(import_module(name), optionflags=doctest.ELLIPSIS)
     assert result.attempted

@@ -41,6 +41,7 @@ from splatseed.depth._kernels import (
 )
 from splatseed.depth.settings import DepthSettings
 from splatseed.depth.views import DepthView, Reduced
+from splatseed.frozen import read_only_view
 from splatseed.progress import Progress, in_threads
 
 VIEWS_PER_TASK = 8
@@ -194,11 +195,11 @@ def find_support(
     # The sum over three channels of 8 bits.
     limit = np.inf if settings.color_tolerance is None else 3 * 255 * settings.color_tolerance
     rgb = np.empty((len(xyz), 3), np.uint8)
-    own_colors(xyz, own.grid_from_world, own.rgb, own.rgb_from_grid, rgb)
+    own_colors(xyz, own.grid_from_world, read_only_view(own.rgb), own.rgb_from_grid, rgb)
     for rank, other in enumerate(others):
         add_support(
-            xyz, rgb, other.z, other.factor, other.grid_from_world, other.rgb, other.rgb_from_grid,
-            settings.tolerance, limit, settings.min_agreeing, rank >= ALWAYS_COMPARED, agreeing,
-            seen_through,
+            xyz, rgb, other.z, other.factor, other.grid_from_world,
+            read_only_view(other.rgb), other.rgb_from_grid, settings.tolerance, limit,
+            settings.min_agreeing, rank >= ALWAYS_COMPARED, agreeing, seen_through,
         )  # fmt: skip
     return agreeing, seen_through

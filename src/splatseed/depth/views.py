@@ -31,6 +31,7 @@ from splatseed.depth.alignment import (
 )
 from splatseed.depth.settings import DepthSettings
 from splatseed.depthmap import DepthMap, DepthMaps, in_scene_units
+from splatseed.frozen import read_only_view
 from splatseed.io.photograph_checks import check_sizes
 from splatseed.photos.loading import refuse_distortion
 from splatseed.photos.view import surface_pixels
@@ -199,7 +200,7 @@ def sample_pixels(
     edges = (0, np.inf)
     if settings.edge_tolerance is not None:
         edges = settings.edge_radius, settings.edge_tolerance
-    pixel, tried = np.empty(0, np.int64), 0
+    pixel, tried, values = np.empty(0, np.int64), 0, read_only_view(values)
     for _ in range(SAMPLING.max_rounds):
         missing = num - len(pixel)
         if missing <= 0:

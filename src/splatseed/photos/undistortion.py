@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
 from splatseed.camera import Intrinsics
+from splatseed.frozen import read_only_view
 from splatseed.lens import distort, fold_radius
 from splatseed.photos._kernels import resample
 from splatseed.projection import denormalized, normalized, pixel_centers
@@ -35,5 +36,5 @@ def undistort(
             uv = denormalized(K, distort(lens, rays))
         # Beyond the fold the lens maps two rays to one pixel.
         uv[np.linalg.norm(rays, axis=-1) > limit] = np.nan
-        resample(photograph, uv, out[rows], known[rows])
+        resample(read_only_view(photograph), uv, out[rows], known[rows])
     return out, known

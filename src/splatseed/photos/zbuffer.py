@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
 from splatseed.camera import Camera
+from splatseed.frozen import read_only_view
 from splatseed.photos._kernels import drop_hidden, find_cells, lower_quartiles, sort_by_cell
 from splatseed.photos.visibility import SURFACE, PointsInImage, points_in_image
 
@@ -51,7 +52,8 @@ def cell_counts(
 def _cells(camera: Camera, xyz: Float32[np.ndarray, "N 3"], cell: float) -> tuple[np.ndarray, ...]:
     """The cell (row by row; -1 outside) and the depth of each point."""
     cells, depths = np.empty(len(xyz), np.int32), np.empty(len(xyz), np.float32)
-    find_cells(xyz, camera.cells_from_world(cell), *camera.grid_shape(cell), cells, depths)
+    grid = camera.cells_from_world(cell), *camera.grid_shape(cell)
+    find_cells(read_only_view(xyz), *grid, cells, depths)
     return cells, depths
 
 

@@ -24,6 +24,7 @@ from splatseed.depth.settings import DepthSettings
 from splatseed.depth.stereo.maps import StereoResult
 from splatseed.depthmap import MIN_CONFIDENCE, DepthMap, DepthMaps
 from splatseed.findings import Finding
+from splatseed.frozen import read_only_view
 from splatseed.lens import project_rays
 from splatseed.methods import source_code
 from splatseed.photos.view import View
@@ -229,7 +230,8 @@ def depth_at_cells(view: View, image: Image, depth: DepthMap, cell: float) -> Ce
     settings, known = DepthSettings(), np.isfinite(z)
     number = places.astype(np.int64)[known] @ [1, depth.width]
     near = np.empty(len(number), np.bool_)
-    find_edges(depth.values, number, settings.edge_radius, settings.edge_tolerance, near)
+    values = read_only_view(depth.values)
+    find_edges(values, number, settings.edge_radius, settings.edge_tolerance, near)
     z[np.flatnonzero(known)[near]] = np.nan
     cells = np.full((rows, cols), np.nan, np.float32)
     cells[inside] = z

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, Int64
 
 from splatseed.errors import ParameterError, PointCloudError
+from splatseed.frozen import read_only_view
 from splatseed.methods import Upsampler, source_code
 from splatseed.photos.view import View
 from splatseed.pointcloud import ORIGINAL, PointCloud
@@ -234,5 +235,5 @@ def _places_in_views(xyz: Float32[np.ndarray, "N 3"], views: Sequence[View]) -> 
     sizes = np.array([[view.width, view.height] for view in views], np.float64)
     shape = len(xyz), min(CLOSEST, len(views))
     group, place = np.full(shape, -1, np.int32), np.zeros((*shape, 3), np.float32)
-    kernels.find_closest(xyz, matrices, focals, sizes, group, place)
+    kernels.find_closest(read_only_view(xyz), matrices, focals, sizes, group, place)
     return _Places(group, place)

@@ -17,6 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 
+from splatseed.frozen import read_only_view
 from splatseed.synthetic._kernels import first_disc, first_wave_crossing, nearest_disc
 
 Vector = Float64[np.ndarray, " 3"]
@@ -373,7 +374,7 @@ class Discs(Surface):
 
     def _nearest(self, xyz: np.ndarray) -> Any:
         points = np.ascontiguousarray(xyz, np.float64)
-        return nearest_disc(points, self.centers, self.axes, self.radii)
+        return nearest_disc(read_only_view(points), self.centers, self.axes, self.radii)
 
     def sample(self, num: int, rng: np.random.Generator) -> Points:
         leaf = rng.choice(len(self.radii), num, p=self.radii**2 / (self.radii**2).sum())

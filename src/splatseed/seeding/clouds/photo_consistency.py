@@ -28,6 +28,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8, UInt16
 
 from splatseed.errors import PointCloudError
+from splatseed.frozen import read_only_view
 from splatseed.photos.view import View
 from splatseed.photos.visibility import points_in_image
 from splatseed.photos.zbuffer import cell_counts
@@ -188,7 +189,7 @@ def find_evidence(
     steps = max(len(range(0, num, BLOCK)) * len(views), 1)
     for b, start in enumerate(range(0, num, BLOCK)):
         part = slice(start, start + BLOCK)
-        block = xyz[part]
+        block = read_only_view(xyz[part])
         closeness = np.zeros((len(block), closest), np.float32)
         samples = np.zeros((len(block), closest, 3), np.uint8)
         for v, view in enumerate(views):
