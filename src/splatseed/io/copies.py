@@ -16,6 +16,7 @@ from splatseed.io.files import open_file
 from splatseed.scene import Image, Scene
 from splatseed.text import agreeing, counted
 
+COPIES = "copied-photographs"
 _PROBE = 4096
 """Bytes from the middle of a file that are compared before all of them."""
 _PART = 1 << 20
@@ -43,7 +44,7 @@ def without_copies(scene: Scene) -> Scene:
     copy, original = next(iter(originals.items()))
     are = agreeing(len(originals), "is a copy of another", "are copies of others")
     text = f"{counted(len(originals), 'photograph')} {are} and left out, such as {copy} of "
-    finding = Finding("copied-photographs", f"{text}{original}.", subjects=tuple(originals))
+    finding = Finding(COPIES, f"{text}{original}.", subjects=tuple(originals))
     return scene.replace(
         images=tuple(image for image in scene.images if image.name not in originals),
         absent=(*scene.absent, *originals),
