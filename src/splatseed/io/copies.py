@@ -11,6 +11,9 @@ from collections.abc import Callable, Hashable, Iterable
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
+
+from splatseed.errors import SplatseedError
 from splatseed.findings import Finding
 from splatseed.io.files import open_file
 from splatseed.scene import Image, Scene
@@ -22,7 +25,9 @@ _PROBE = 4096
 _PART = 1 << 20
 """Bytes that are read at a time."""
 _PLAIN = 0.02
-"""Bytes per pixel of a picture that shows nothing, as which many photographs can be equal."""
+"""Bytes per pixel of a picture that may show nothing, as which many photographs can be equal."""
+_ONE_COLOR = 2
+"""Range of the values of a picture that shows nothing: lossy formats round."""
 _HEADERS = 1000
 """Bytes of a picture besides its pixels."""
 
@@ -80,7 +85,12 @@ def _digest(path: Path) -> bytes:
 
 
 def _is_plain(image: Image) -> bool:
-    """Whether a photograph is unreadable, or has too few bytes to show anything."""
+    """Whether a photograph is unreadable, or of one colour."""
     if image.size is None:
         return True
-    return _size(image.path) < _HEADERS + _PLAIN * image.size[0] * image.size[1]
+    if _size(image.path) >= _HEADERS + _PLAIN * image.size[0] * image.size[1]:
+        return False
+    try:
+        return int(np.ptp(image.read().reshape(-1, 3), axis=0).max()) <= _ONE_COLOR
+    except SplatseedError:  # reported where its pixels are needed
+        return True
