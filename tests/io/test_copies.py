@@ -66,7 +66,7 @@ def test_a_copy_of_few_bytes_is_left_out(photographed):
     drawing = PilImage.new("RGB", (640, 480), "teal")
     drawing.paste("white", (200, 100, 300, 400))
     drawing.save(paths[0])
-    assert paths[0].stat().st_size < 0.02 * 640 * 480
+    assert paths[0].stat().st_size < 1000 + 0.02 * 640 * 480
     paths[2].write_bytes(paths[0].read_bytes())
     scene = load_scene(folder)
     assert scene.absent == (names[2],)
