@@ -7,9 +7,10 @@ Structure-from-Motion left room, on six, ``auto`` gained -0.12 to 0.50 dB under 
 densification, 0.24 on average, and -0.30 to 0.28 under strategy ``grow``, -0.02 on average, with a
 quarter of a Gaussian per pixel; with one per pixel 0.27 and 0.28 on average, the latter from one
 capture (dorm, 1.27; the others at most 0.24). Where its points alone filled the budget (bonsai,
-treehill), adding points cost up to 0.4 dB. What tells dorm from the others is the share of cells of
-the pictures without a point: below ``MAX_BARE`` ``auto`` gained nothing under ``grow``, above 0.02
-to 2.3 dB, most in short runs. No such number is a prediction for another capture, so advice has none.
+treehill), adding points cost up to 0.4 dB. Under ``grow`` the share of the pictures' cells without
+a point tells dorm from the others: below ``MAX_BARE`` ``auto`` gained -0.28 to 0.24 dB, above it
+0.02 to 1.27, and up to 2.3 in short runs. That predicts nothing for another capture, so advice
+gives no gain.
 """
 
 from __future__ import annotations
