@@ -265,7 +265,7 @@ def read_opacity(photograph: Path, factor: int = 1) -> UInt8[np.ndarray, "h w"] 
     alpha = read_alpha(photograph)
     if alpha is None or (alpha >= OPAQUE).all():
         return None
-    return np.rint(_blocks(alpha, factor).mean(axis=(1, 3))).astype(np.uint8)
+    return np.asarray(np.rint(_blocks(alpha, factor).mean(axis=(1, 3))), np.uint8)
 
 
 def _reduced(counts: Bool[np.ndarray, "H W"], factor: int) -> Bool[np.ndarray, "h w"]:
