@@ -42,6 +42,8 @@ ARMS: Mapping[str, Mapping[str, Any]] = {
     "auto, photographs alone": {"method": "auto", "dense": False, "depth_maps": False},
     "depth": {"method": "depth"},
     "auto, no points": {"method": "auto", "dense": False, "points": False},
+    "1,500 of sfm": {"method": "linear", "ratio": 1, "kept": 1500},
+    "auto, 1,500 of sfm": {"method": "auto", "dense": False, "kept": 1500},
     "auto, refined": {"method": "auto", "dense": False, "refined": True},
     "triangulated": {"method": "linear", "ratio": 1, "refined": True},
     "dense": {"method": "auto"},
@@ -183,6 +185,9 @@ def _seeds(scene: Scene, arm: str, settings: TrainSettings) -> PointCloud:
         return random_start(scene, np.random.default_rng(settings.seed), chosen["random"])
     if not chosen.pop("points", True):
         scene = scene.replace(points=PointCloud.empty(), tracks=None)
+    if kept := chosen.pop("kept", None):
+        drawn = np.random.default_rng(settings.seed).permutation(len(scene.points))[:kept]
+        scene = scene.replace(points=scene.points.select(np.sort(drawn)), tracks=None)
     chosen.pop("refined", None)
     name = chosen.pop("method")
     size = stereo_size(scene.split(TEST_EVERY)[0], settings, "cpu")

@@ -189,6 +189,20 @@ class Image:
 
         return read_empty(self.path, factor) if self.shows_empty_space else None
 
+    def read_opacity(self, factor: int = 1) -> UInt8[np.ndarray, "h w"] | None:
+        """Read the alpha of pixels, 255 if opaque; None if none show empty space.
+
+        Args:
+            factor: Integer reduction; a reduced pixel has the mean of its ``factor``^2 block.
+
+        Raises:
+            SceneNotFoundError: There is no such file.
+            SceneFormatError: It is no image, or damaged.
+        """
+        from splatseed.io.masks import read_opacity
+
+        return read_opacity(self.path, factor) if self.shows_empty_space else None
+
     @property
     def shows_empty_space(self) -> bool:
         """Whether transparent pixels, if there are any, count: as background, empty space."""

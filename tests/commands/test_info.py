@@ -49,7 +49,7 @@ def test_a_colmap_scene(room, splatseed, monkeypatch):
     low = [float(x) for x in rows["bounding box"].split()[:3]]
     np.testing.assert_allclose(low, scene.points.xyz.min(axis=0), rtol=1e-3)
     advised = run.out.partition("\nnext\n")[2]
-    assert re.findall(r"splatseed (\w+)", advised) == ["train", "train", "info"]
+    assert re.findall(r"splatseed (\w+)", advised) == ["train", "train", "upsample"]
     assert rows["photographs agree"].endswith("of the pixels compared: enough")
 
 
@@ -96,9 +96,10 @@ def test_the_advice_depends_on_the_plan(room, splatseed):
     assert "there is no room for more" in full
     assert "--seeds scene --budget 60 --max-steps 500" in full.partition("\nnext\n")[2]
     sparse = splatseed("info", room, "--budget", 3456, "--max-steps", 20000).out
-    assert "leave the points as they are" in sparse
-    assert "Strategy grow puts new Gaussians" in " ".join(sparse.split())
-    assert "--seeds scene --budget 3456 --max-steps 20000" in sparse
+    assert "add points by method auto" in sparse
+    assert "No point falls in 75% of the cells" in " ".join(sparse.split())
+    assert "--seeds" not in sparse  # train follows the same rule
+    assert "--budget 3456 --max-steps 20000" in sparse
     assert "3,456 Gaussians at most (0.5rho of 96 x 72 pixels), 20,000 steps" in sparse
 
 

@@ -62,7 +62,7 @@ def test_what_info_advises_works(points, bent, tmp_path, monkeypatch, splatseed)
     monkeypatch.setattr(next_steps, "which", lambda _: None)  # as without a GPU
     run = splatseed("info", scene)
     assert run.code == 0, run.err
-    wanted = ["train", "train", *(["info"] if points else ["upsample", "sfm"])]
+    wanted = ["train", "train", "upsample", *([] if points else ["sfm"])]
     assert follow(run.out, splatseed) == ["undistort", *wanted]
     assert re.search(r"\n  train, about \d+ (s|minutes|hours) +splatseed train", run.out), run.out
     for folder in ("RUN", "SMALL"):
@@ -114,7 +114,7 @@ def test_nothing_is_to_be_trained_without_its_photographs(kept, own_room, tmp_pa
         assert "-> mls" in run.out
         assert "Without photographs" in run.out
     advised = lines_of(splatseed("info", own_room).out)
-    assert [words[0] for words in advised] == ["upsample" if kept == "no folder" else "view"]
+    assert [words[0] for words in advised] == ["upsample"]
 
 
 def test_a_cloud_alone_is_advised(room, tmp_path, monkeypatch, splatseed):

@@ -58,3 +58,28 @@ def test_equal_sizes_and_plain_pictures_are_no_copies(photographed):
     for path in paths:
         PilImage.new("RGB", (640, 480), "teal").save(path)
     assert not load_scene(folder).absent
+
+
+def test_a_copy_of_few_bytes_is_left_out(photographed):
+    """A drawing compresses well, unlike a photograph."""
+    folder, paths, names = photographed
+    drawing = PilImage.new("RGB", (640, 480), "teal")
+    drawing.paste("white", (200, 100, 300, 400))
+    drawing.save(paths[0])
+    assert paths[0].stat().st_size < 1000 + 0.02 * 640 * 480
+    paths[2].write_bytes(paths[0].read_bytes())
+    scene = load_scene(folder)
+    assert scene.absent == (names[2],)
+    assert names[0] in {image.name for image in scene.split()[1]}
+
+
+@pytest.mark.parametrize("test_every", [2, 3, 8])
+def test_no_training_image_is_a_copy_of_a_test_image(photographed, test_every):
+    folder, paths, names = photographed
+    paths[3].write_bytes(paths[0].read_bytes())
+    paths[1].write_bytes(paths[2].read_bytes())
+    parts = load_scene(folder).split(test_every)
+    shown = [{image.path.read_bytes() for image in part} for part in parts]
+    assert not shown[0] & shown[1]
+    assert {*shown[0], *shown[1]} == {paths[0].read_bytes(), paths[2].read_bytes()}
+    assert names[0] in {image.name for image in parts[1]}

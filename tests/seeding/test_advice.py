@@ -13,16 +13,20 @@ from splatseed.scene import Image, Scene
 from splatseed.seeding.advice import AS_IT_IS, Measured, advise, measure
 from splatseed.training.traits import STRATEGIES
 
-FERN = Measured(6_009, 120_000, empty=0.4)
+FERN = Measured(6_009, 120_000, empty=0.24)
+DORM = Measured(5_740, 89_600, empty=0.48)  # bare walls
 
 
 @pytest.mark.parametrize(
     ("measured", "most", "strategy", "method", "says"),
     [
         (Measured(108_040, 106_400), 18_655, "default", AS_IT_IS, ["108,040", "no room"]),
-        (FERN, 21_000, "default", "auto", ["3.5 times", "40%"]),
+        (FERN, 21_000, "default", "auto", ["3.5 times", "24%"]),
         (FERN, 6_500, "default", AS_IT_IS, ["6,009", "no room"]),
-        (FERN, 30_000, "grow", AS_IT_IS, ["6,009", "stereo"]),
+        (FERN, 30_000, "grow", AS_IT_IS, ["6,009", "24%"]),
+        (replace(FERN, empty=None), 30_000, "grow", AS_IT_IS, ["6,009", "stereo"]),
+        (DORM, 89_600, "grow", "auto", ["15.6 times", "48%"]),
+        (DORM, 6_000, "grow", AS_IT_IS, ["5,740", "no room"]),
         (FERN, 30_000, "mcmc", "auto", []),
         (replace(FERN, num_points=0), 30_000, "grow", "auto", ["no points"]),
         (replace(FERN, depth_maps=True), 21_000, "default", "depth", []),
@@ -37,6 +41,13 @@ def test_what_is_there_decides_the_method(measured, most, strategy, method, says
     per_pixel = "per pixel of a photograph's" in said.reasons[0]
     assert per_pixel == (measured.num_points > 0 and measured.photographs)
     assert ("leave" in said.sentence) == (method == AS_IT_IS)
+
+
+@pytest.mark.parametrize("measured", [FERN, DORM, replace(FERN, num_points=100_000)])
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_no_gain_of_other_captures_is_promised(measured, strategy):
+    said = advise(measured, 90_000, why_no_seeds=STRATEGIES[strategy].why_no_seeds)
+    assert "dB" not in " ".join((said.sentence, *said.reasons))
 
 
 def test_scoring_may_ask_for_another_room():

@@ -17,7 +17,8 @@ from splatseed.io.masks import with_masks
 from splatseed.photos.loading import load_views
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.metrics import mirrored_ssim
-from splatseed.splat.photographs import fill_masked
+from splatseed.splat.photographs import fill_masked, over_background, photograph_tensor
+from splatseed.splat.rendering import render_view
 from splatseed.training import trainer
 from splatseed.training.evaluation import Evaluation
 from splatseed.training.prepare import prepare_run
@@ -138,17 +139,49 @@ def test_masks_that_changed_since_a_run_began_are_found_out(larger_room_path, tm
 
 def test_nothing_is_around_an_object_that_is_cut_out(larger_room_path, tmp_path):
     """Renders are black where photographs are transparent, unless these pixels are left out."""
-    path = shutil.copytree(larger_room_path, tmp_path / "cut")
-    for i, file in enumerate(sorted((path / "images").iterdir())):
-        alpha = np.zeros((72, 96), np.uint8)
-        alpha[12:60, 16 + i : 64 + i] = 250
-        with PilImage.open(file) as photograph:
-            photograph.putalpha(PilImage.fromarray(alpha))
-            photograph.save(file)
-    scene = load_scene(path)
+    scene = _cut_out(larger_room_path, tmp_path / "cut")
     outside = {}
     for masks in (None, "alpha"):
         run = train(scene, tmp_path / f"{masks}", max_steps=60, strategy="none", masks=masks)
         (view, *_) = load_views(scene, scene.images[:1])
         outside[masks] = run.render(view.camera)[view.empty].mean()
     assert outside[None] < 0.5 * outside["alpha"]
+
+
+def _cut_out(source, path, color=None):
+    """The room with a box of each photograph cut out, in a colour if given."""
+    shutil.copytree(source, path)
+    for i, file in enumerate(sorted((path / "images").iterdir())):
+        alpha = np.zeros((72, 96), np.uint8)
+        alpha[12:60, 16 + i : 64 + i] = 250
+        with PilImage.open(file) as photograph:
+            cut = photograph.convert("RGB")
+            if color is not None:
+                cut.paste(color, (0, 0, *cut.size))
+            cut.putalpha(PilImage.fromarray(alpha))
+            cut.save(file)
+    return load_scene(path)
+
+
+@pytest.mark.parametrize("factor", [1, 2])
+def test_photographs_are_composited_over_any_background(larger_room_path, tmp_path, factor):
+    scene = _cut_out(larger_room_path, tmp_path / "cut")
+    (view,) = load_views(scene, scene.images[:1], data_factor=factor)
+    with PilImage.open(scene.images[0].path) as photograph:
+        orange = PilImage.new("RGBA", photograph.size, (255, 128, 0))
+        expected = PilImage.alpha_composite(orange, photograph.convert("RGBA")).convert("RGB")
+    background = torch.tensor([1.0, 128 / 255, 0.0])
+    got = over_background(photograph_tensor(view, background.device), view, background)
+    wanted = np.asarray(expected.reduce(factor)) / 255
+    np.testing.assert_allclose(got.numpy(), wanted, atol=2.1 / 255)
+
+
+def test_a_black_object_does_not_become_transparent(larger_room_path, tmp_path):
+    scene = _cut_out(larger_room_path, tmp_path / "cut", "black")
+    settings = TrainSettings(max_steps=80, data_factor=2, strategy="none")
+    run = prepare_run(scene, tmp_path / "run", settings)
+    run.train()
+    view = run.trainer.train_views[0]
+    over_white = render_view(run.state.params, view, 0, torch.ones(3))[0].detach().mean(dim=-1)
+    assert over_white[view.opacity == 250].mean() < 0.3
+    assert over_white[view.opacity == 0].mean() > 0.6

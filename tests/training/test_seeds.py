@@ -89,18 +89,29 @@ def test_a_plain_scene_is_seeded_on_request_and_the_user_told(room):
     assert not findings[-1].fix  # there are none to begin with
 
 
-@pytest.mark.parametrize(("strategy", "points", "added"), [
-    ("grow", slice(None), False),
-    ("grow", slice(0), True),
-    ("default", slice(None), True),
+def _covering(scene):
+    """Points in all parts of the pictures."""
+    uv = np.stack(np.meshgrid(np.arange(1.5, 96, 3), np.arange(1.5, 72, 3)), axis=-1).reshape(-1, 2)
+    xyz = [image.camera.unproject(uv, np.full(len(uv), 3.0)) for image in scene.images]
+    positions = np.concatenate(xyz).astype(np.float32)
+    return PointCloud(positions, np.full(positions.shape, 128, np.uint8))
+
+
+@pytest.mark.parametrize(("strategy", "points", "says"), [
+    ("grow", "covering", "Seeds: leave the points as they are. No point falls in 0% of"),
+    ("grow", "few", "Seeds by method auto: 210 points of the scene and"),
+    ("grow", "none", "Seeds by method auto:"),
+    ("default", "covering", "Seeds by method auto:"),
 ])  # fmt: skip
-def test_seeds_are_added_where_that_is_advised(strategy, points, added, room):
-    scene = room.replace(points=room.points.select(points), tracks=None)
-    asked = TrainSettings(seeding="advised", strategy=strategy, cap_max=2000)
+def test_seeds_are_added_where_that_is_advised(strategy, points, says, room):
+    clouds = {"few": room.points, "none": PointCloud.empty(), "covering": _covering(room)}
+    scene = room.replace(points=clouds[points], tracks=None)
+    asked = TrainSettings(seeding="advised", strategy=strategy, cap_max=20_000)
     findings = []
     made, _ = seeded(scene, asked, "cpu", findings.append, silent)
-    assert (len(made.points) > len(scene.points)) == added
-    assert findings[-1].text.startswith("Seeds by method auto:" if added else "Seeds: leave the")
+    assert findings[-1].text.startswith(says)
+    assert (len(made.points) > len(scene.points)) == ("auto" in says)
+    assert ("No point falls in 80% of" in findings[-1].text) == (points == "few")
 
 
 @pytest.mark.parametrize("why", ["as it is", "3dgs", "added to", "thinned"])

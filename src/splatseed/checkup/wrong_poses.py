@@ -11,7 +11,7 @@ say the same. Photographs that share too few points with others are not checked.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -137,11 +137,17 @@ def without_wrong_poses(
 ) -> tuple[Scene, tuple[Finding, ...]]:
     """Leave out the images that ``find_wrong_poses`` names; also return what was found."""
     findings = find_wrong_poses(scene, comparable(scene), progress)
-    wrong = {name for finding in findings for name in finding.subjects}
-    if not wrong:
+    return leave_out(scene, [name for finding in findings for name in finding.subjects])
+
+
+def leave_out(scene: Scene, wrong: Collection[str]) -> tuple[Scene, tuple[Finding, ...]]:
+    """Leave out images whose poses are known to be wrong, as far as they are there; say so."""
+    names = tuple(sorted({name for name in wrong if name in scene}))
+    if not names:
         return scene, ()
-    images = tuple(image for image in scene.images if image.name not in wrong)
-    left = scene.replace(images=images, absent=(*scene.absent, *sorted(wrong)))
-    text = f"{counted(len(wrong), 'photograph')} with wrong poses are left out: "
-    text += f"{', '.join(sorted(wrong)[:NAMED])}{' ...' if len(wrong) > NAMED else ''}."
-    return left, (Finding(WRONG_POSES, text, "info", tuple(sorted(wrong))),)
+    images = tuple(image for image in scene.images if image.name not in names)
+    left = scene.replace(images=images, absent=(*scene.absent, *names))
+    which = agreeing(len(names), "with a wrong pose is", "with wrong poses are")
+    text = f"{counted(len(names), 'photograph')} {which} left out: "
+    text += f"{', '.join(names[:NAMED])}{' ...' if len(names) > NAMED else ''}."
+    return left, (Finding(WRONG_POSES, text, "info", names),)

@@ -11,17 +11,23 @@ from collections.abc import Callable, Hashable, Iterable
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
+
+from splatseed.errors import SplatseedError
 from splatseed.findings import Finding
 from splatseed.io.files import open_file
 from splatseed.scene import Image, Scene
 from splatseed.text import agreeing, counted
 
+COPIES = "copied-photographs"
 _PROBE = 4096
 """Bytes from the middle of a file that are compared before all of them."""
 _PART = 1 << 20
 """Bytes that are read at a time."""
 _PLAIN = 0.02
-"""Bytes per pixel of a picture that shows nothing, as which many photographs can be equal."""
+"""Bytes per pixel of a picture that may show nothing, as which many photographs can be equal."""
+_ONE_COLOR = 2
+"""Range of the values of a picture that shows nothing: lossy formats round."""
 _HEADERS = 1000
 """Bytes of a picture besides its pixels."""
 
@@ -43,7 +49,7 @@ def without_copies(scene: Scene) -> Scene:
     copy, original = next(iter(originals.items()))
     are = agreeing(len(originals), "is a copy of another", "are copies of others")
     text = f"{counted(len(originals), 'photograph')} {are} and left out, such as {copy} of "
-    finding = Finding("copied-photographs", f"{text}{original}.", subjects=tuple(originals))
+    finding = Finding(COPIES, f"{text}{original}.", subjects=tuple(originals))
     return scene.replace(
         images=tuple(image for image in scene.images if image.name not in originals),
         absent=(*scene.absent, *originals),
@@ -79,7 +85,12 @@ def _digest(path: Path) -> bytes:
 
 
 def _is_plain(image: Image) -> bool:
-    """Whether a photograph is unreadable, or has too few bytes to show anything."""
+    """Whether a photograph is unreadable, or of one colour."""
     if image.size is None:
         return True
-    return _size(image.path) < _HEADERS + _PLAIN * image.size[0] * image.size[1]
+    if _size(image.path) >= _HEADERS + _PLAIN * image.size[0] * image.size[1]:
+        return False
+    try:
+        return int(np.ptp(image.read().reshape(-1, 3), axis=0).max()) <= _ONE_COLOR
+    except SplatseedError:  # reported where its pixels are needed
+        return True

@@ -19,7 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Shaped, UInt8
 from numpy.lib.stride_tricks import sliding_window_view
 from PIL import Image as PilImage
 
@@ -29,7 +29,14 @@ from splatseed.findings import Finding, without_kinds
 from splatseed.io.depth_maps import Undistortion
 from splatseed.io.files import files_below, read_bytes, translate_errors
 from splatseed.io.mask_files import SUFFIXES, find_masks, find_own_masks, masks_among
-from splatseed.io.photograph import has_alpha, open_photograph, photograph_bytes, read_transparent
+from splatseed.io.photograph import (
+    OPAQUE,
+    has_alpha,
+    open_photograph,
+    photograph_bytes,
+    read_alpha,
+    read_transparent,
+)
 from splatseed.io.photograph_checks import photograph_size
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.sampling import strided
@@ -141,12 +148,11 @@ def _with_transparency(masks: Masks, paths: Sequence[Path]) -> tuple[Masks, list
     alike = {each.shape for each in pixels} == {pixels[0].shape}
     changing = np.any(pixels, axis=0) & ~np.all(pixels, axis=0) if alike else np.ones(1, np.bool_)
     if not masks.alpha or (np.median(shares) >= _CUT_OUT and changing.mean() >= _CHANGING):
-        text = f"{share}, are empty space: as the background, black unless said otherwise, in "
-        text += "training and in scores."
+        text = f"{share}, are empty space: any colour in training, the background in scores."
         fix = f"`masks={ALPHA!r}` leaves them out of both."
         return replace(masks, alpha=False), [Finding(TRANSPARENT, text, "info", fix=fix)]
     text = f"{share}, are left out of training and of scores."
-    fix = f"`masks={NONE!r}` trains them as empty space, in black."
+    fix = f"`masks={NONE!r}` trains them as empty space."
     return masks, [Finding(TRANSPARENT, text, "info", fix=fix)]
 
 
@@ -251,10 +257,24 @@ def read_empty(photograph: Path, factor: int = 1) -> Bool[np.ndarray, "h w"] | N
     return ~_reduced(~transparent, factor)
 
 
+def read_opacity(photograph: Path, factor: int = 1) -> UInt8[np.ndarray, "h w"] | None:
+    """Read the alpha of a photograph with transparent pixels; None without any.
+
+    That of a reduced pixel is the mean of its ``factor``^2 block, as its colour over black is.
+    """
+    alpha = read_alpha(photograph)
+    if alpha is None or (alpha >= OPAQUE).all():
+        return None
+    return np.asarray(np.rint(_blocks(alpha, factor).mean(axis=(1, 3))), np.uint8)
+
+
 def _reduced(counts: Bool[np.ndarray, "H W"], factor: int) -> Bool[np.ndarray, "h w"]:
-    rows, columns = counts.shape[0] // factor, counts.shape[1] // factor
-    blocks = counts[: rows * factor, : columns * factor].reshape(rows, factor, columns, factor)
-    return np.asarray(blocks.all(axis=(1, 3)))
+    return np.asarray(_blocks(counts, factor).all(axis=(1, 3)))
+
+
+def _blocks(pixels: Shaped[np.ndarray, "H W"], factor: int) -> Shaped[np.ndarray, "h f w f"]:
+    rows, columns = pixels.shape[0] // factor, pixels.shape[1] // factor
+    return pixels[: rows * factor, : columns * factor].reshape(rows, factor, columns, factor)
 
 
 def _read_counts(path: Path) -> Bool[np.ndarray, "H W"]:

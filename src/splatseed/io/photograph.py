@@ -141,6 +141,12 @@ def read_photograph(
 
 def read_transparent(path: Path) -> Bool[np.ndarray, "H W"] | None:
     """Read which pixels have an alpha below ``OPAQUE``; None if none can have."""
+    alpha = read_alpha(path)
+    return None if alpha is None else alpha < OPAQUE
+
+
+def read_alpha(path: Path) -> UInt8[np.ndarray, "H W"] | None:
+    """Read the alpha of pixels, 255 if opaque; None if none can be transparent."""
     if path.suffix.lower() in {".jpg", ".jpeg"}:  # never transparent: skip reading
         return None
     encoded = photograph_bytes(path)
@@ -151,10 +157,11 @@ def read_transparent(path: Path) -> Bool[np.ndarray, "H W"] | None:
         if is_16_bit(photograph):
             values = read_16_bit(encoded)
             if values.shape[-1] not in _WITH_ALPHA:  # transparent by one colour
-                return np.asarray(np.all(values == photograph.info["transparency"], axis=-1))
-            alpha = values[..., -1]
-            return np.asarray(alpha < opaque_value(alpha) * np.float32(OPAQUE / 255))
-        return np.asarray(np.asarray(photograph.convert("RGBA").getchannel("A")) < OPAQUE)
+                opaque = np.any(values != photograph.info["transparency"], axis=-1)
+                return np.where(opaque, 255, 0).astype(np.uint8)
+            alpha = values[..., -1].astype(np.uint32)  # rounded down, so that half stays half
+            return (alpha * 255 // opaque_value(values[..., -1])).astype(np.uint8)
+        return np.asarray(photograph.convert("RGBA").getchannel("A"))
 
 
 def has_alpha(photograph: PilImage.Image) -> bool:

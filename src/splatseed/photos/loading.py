@@ -159,7 +159,8 @@ def _load_view(
     camera = Camera(K, width, height, image.camera.cam_from_world)
     mask, empty = image.read_mask(data_factor), image.read_empty(data_factor)
     if not lens.has_distortion:
-        return View(image.name, photograph, camera, mask, empty)
+        opacity = None if empty is None else image.read_opacity(data_factor)
+        return View(image.name, photograph, camera, mask, empty, opacity)
     from splatseed.photos.undistortion import undistort  # noqa: PLC0415  (loads Numba)
 
     photograph, known = undistort(photograph, lens, K)

@@ -33,7 +33,8 @@ class View:
     photograph: UInt8[np.ndarray, "H W 3"]  # sRGB; ``NO_PIXELS`` if it is not loaded
     camera: Camera  # in pixels of the photograph
     mask: Bool[np.ndarray, "H W"] | None = None  # pixels that count; None: all
-    empty: Bool[np.ndarray, "H W"] | None = None  # pixels that show nothing, in black; None: none
+    empty: Bool[np.ndarray, "H W"] | None = None  # pixels that show nothing; None: none
+    opacity: UInt8[np.ndarray, "H W"] | None = None  # alpha of pixels over black; None: opaque
     near: float = NEAR_PLANE  # Gaussians nearer than this are not rendered; in the pose's unit
 
     @property

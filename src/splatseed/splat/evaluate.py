@@ -26,9 +26,11 @@ require("torch", "flip_evaluator")  # before the imports below, for one clear er
 import torch
 from torch import Tensor
 
+from splatseed.checkup.wrong_poses import WRONG_POSES
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.findings import Finding
 from splatseed.io import load_scene
+from splatseed.io.copies import COPIES
 from splatseed.io.masks import TRANSPARENT, with_masks
 from splatseed.io.photograph import photographs_digest
 from splatseed.io.photograph_checks import with_photographs
@@ -226,10 +228,12 @@ def load_model(
     scene = with_masks(scene, masks)
     known = background_of(path, background, findings.append)
     scene = scene.replace(background=known or BLACK)
-    findings += [each for each in scene.findings if each.kind == TRANSPARENT]
+    reported = (TRANSPARENT, COPIES, WRONG_POSES)
+    findings += [each for each in scene.findings if each.kind in reported]
     if scene.images:
         scene = _with_test_photographs(scene, test_every)
-    if gone := scene.absent:
+    explained = {name for finding in findings for name in finding.subjects}
+    if gone := [name for name in scene.absent if name not in explained]:
         are = agreeing(len(gone), "image of the scene is", "images of the scene are")
         text = f"{len(gone)} {are} left out, without a photograph or a pose: {name_some(gone, 3)}."
         findings.append(Finding("missing-photographs", text, subjects=tuple(gone)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from weakref import WeakKeyDictionary
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
@@ -55,15 +56,34 @@ def _bytes_of(view: View, device: torch.device) -> UInt8[Tensor, "H W 3"]:
 
 
 _MASKS: WeakKeyDictionary[View, dict[torch.device, Bool[Tensor, "H W"]]] = WeakKeyDictionary()
+_OPACITIES: WeakKeyDictionary[View, dict[torch.device, UInt8[Tensor, "H W"]]] = WeakKeyDictionary()
 
 
 def mask_tensor(view: View, device: torch.device) -> Bool[Tensor, "H W"] | None:
     """Return the mask of a view's valid pixels, None for all; cached while the view lives."""
-    if view.mask is None:
-        return None
-    cached = _MASKS.setdefault(view, {})
+    return None if view.mask is None else _cached(_MASKS, view, view.mask, device)
+
+
+def over_background(
+    photograph: Float[Tensor, "H W 3"], view: View, background: Float[Tensor, " 3"]
+) -> Float[Tensor, "H W 3"]:
+    """Composite a view's photograph, which is over black, over a colour."""
+    if view.opacity is None:
+        return photograph
+    opacity = _cached(_OPACITIES, view, view.opacity, photograph.device)
+    return photograph + (1.0 - opacity[..., None] / 255.0) * background
+
+
+def _cached(
+    kept: WeakKeyDictionary[View, dict[torch.device, Tensor]],
+    view: View,
+    pixels: np.ndarray,
+    device: torch.device,
+) -> Tensor:
+    """Return pixels of a view as a tensor; kept while the view lives."""
+    cached = kept.setdefault(view, {})
     if device not in cached:
-        cached[device] = torch.tensor(view.mask).to(device)
+        cached[device] = torch.tensor(pixels).to(device)
     return cached[device]
 
 

@@ -47,13 +47,16 @@ def camera_tensors(view: View, device: torch.device) -> CameraTensors:
 
 
 def render_view(
-    params: Mapping[str, Tensor] | torch.nn.ParameterDict, view: View, sh_degree: int
+    params: Mapping[str, Tensor] | torch.nn.ParameterDict,
+    view: View,
+    sh_degree: int,
+    background: Float[Tensor, " 3"] | None = None,
 ) -> tuple[Float[Tensor, "H W 3"], dict[str, Any]]:
-    """Render a view; return the image and the rasteriser's ``info``.
+    """Render a view, by default over black; return the image and the rasteriser's ``info``.
 
     Harmonics beyond ``sh_degree`` are ignored. Gaussians and pose are in one frame.
     """
-    images, _, info = _rasterize(params, view, sh_degree)
+    images, _, info = _rasterize(params, view, sh_degree, background=background)
     return images, info
 
 
@@ -95,7 +98,7 @@ def _rasterize(
     mode: Literal["RGB", "ED"] = "RGB",
     *,
     antialiased: bool = False,
-    background: Float[Tensor, "1 3"] | None = None,
+    background: Float[Tensor, " 3"] | None = None,
 ) -> tuple[Float[Tensor, "H W D"], Float[Tensor, "H W 1"], dict[str, Any]]:
     """Render features, or harmonics up to a degree; return image, alphas and ``info``."""
     colors: Tensor | tuple[Tensor, Tensor]
@@ -110,7 +113,7 @@ def _rasterize(
         opacity_from_logits(params["opacities"]), colors, camera.viewmats, camera.Ks,
         view.width, view.height, near_plane=view.near, sh_degree=degree, packed=False,
         render_mode=mode, rasterize_mode="antialiased" if antialiased else "classic",
-        backgrounds=background,
+        backgrounds=None if background is None else background[None],
     )  # fmt: skip
     # Unlike indexing, squeeze's backward allocates no image of zeros.
     return images.squeeze(0), alphas.squeeze(0), info
@@ -136,7 +139,7 @@ class ModelRenderer:
         self._params = {name: torch.tensor(array, device=device) for name, array in arrays.items()}
         self._behind = None
         if any(background):
-            self._behind = torch.tensor([background], dtype=torch.float32, device=device) / 255
+            self._behind = torch.tensor(background, dtype=torch.float32, device=device) / 255
 
     def image(self, view: View) -> Float[Tensor, "H W 3"]:
         """Render a view: about 0 to 1, black or ``background`` behind."""

@@ -11,6 +11,7 @@ import platform
 from collections.abc import Collection, Mapping
 from typing import Any
 
+from splatseed.checkup.wrong_poses import leave_out
 from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io.masks import mask_choice, masks_digest, with_masks
 from splatseed.io.photograph import photographs_digest
@@ -33,8 +34,13 @@ def make_config(
     frame: TrainingFrame | None = None,
     *,
     refine_poses: bool = False,
+    dropped: Collection[str] = (),
 ) -> dict[str, Any]:
-    """Return the content of config.json; ``initial`` are the facts of the seeds or of the start."""
+    """Return the content of config.json.
+
+    ``initial`` are the facts of the seeds or of the start, ``dropped`` the images that the run
+    leaves out for their poses.
+    """
     source = scene.source
     points = None if refine_poses else source.points_path
     config = {
@@ -49,6 +55,7 @@ def make_config(
         "seeds": dict(initial),
         "photographs": photographs_digest(scene),
         "split": _names_of_parts(scene, settings),
+        "dropped": sorted(dropped),
         "versions": {
             "python": platform.python_version(),
             **{name: version_of(name) for name in ("torch", "gsplat", "numba", "numpy")},
@@ -115,7 +122,14 @@ def _check_version(config: Mapping[str, Any]) -> None:
 
 def has_run_poses(config: Mapping[str, Any], scene: Scene) -> bool:
     """Whether a scene has the photographs and poses that a run was trained with."""
-    return config.get("photographs") == photographs_digest(scene)
+    return config.get("photographs") == photographs_digest(without_dropped(scene, config))
+
+
+def without_dropped(scene: Scene, config: Mapping[str, Any]) -> Scene:
+    """Return a scene without the images that a run left out for their poses, and say so in it."""
+    dropped = config.get("dropped")
+    scene, findings = leave_out(scene, dropped if isinstance(dropped, list) else ())
+    return scene.replace(findings=(*scene.findings, *findings)) if findings else scene
 
 
 def check_same_input(folder: RunFolder, config: Mapping[str, Any], now: Mapping[str, Any]) -> None:
@@ -173,7 +187,7 @@ def check_same_scene(
 ) -> None:
     """Refuse to resume with other masks, training or test images."""
     found = "" if has_run_masks(config, scene) else "masks"
-    if config.get("split") != _names_of_parts(scene, settings):
+    if config.get("split") != _names_of_parts(without_dropped(scene, config), settings):
         listed = f" (by its {scene.listed.origin})" if scene.listed else ""
         found = f"training or test images{listed}"
     if found:

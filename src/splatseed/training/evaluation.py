@@ -20,6 +20,7 @@ from splatseed.errors import (
     SplatseedError,
 )
 from splatseed.findings import Finding
+from splatseed.io import load_scene
 from splatseed.io.files import StrPath, read_text
 from splatseed.photos.loading import user_cache_dir
 from splatseed.progress import Progress, silent
@@ -30,7 +31,13 @@ from splatseed.splat.evaluate import OnView, TrainedModel, evaluate_model, load_
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.lpips import load_lpips
 from splatseed.text import counted
-from splatseed.training.config import has_run_masks, has_run_poses, near_plane_of, trained_images
+from splatseed.training.config import (
+    has_run_masks,
+    has_run_poses,
+    near_plane_of,
+    trained_images,
+    without_dropped,
+)
 from splatseed.training.device import pick_device
 from splatseed.training.folder import config_of, model_file
 from splatseed.training.request import AS_TRAINED, EvaluateRequest
@@ -84,10 +91,16 @@ class Evaluation:
         return self.request.test_every or TrainSettings.test_every
 
     def load(self, progress: Progress = silent) -> TrainedModel:
-        """Read the model and the photographs of its test views."""
+        """Read the model and the photographs of its test views.
+
+        Photographs that the run left out for their poses are no test views.
+        """
+        scene = self.scene
+        if not isinstance(scene, Scene):
+            scene = load_scene(scene, require_points=False)
         return load_model(
             self.model,
-            self.scene,
+            without_dropped(scene, self.config),
             data_factor=self.request.data_factor,
             test_every=self.test_every,
             transform=self.request.transform,

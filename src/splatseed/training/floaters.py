@@ -36,8 +36,10 @@ from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.photographs import fill_masked, mask_tensor, photograph_tensor
 from splatseed.splat.rendering import render_view
 from splatseed.splat.training_frame import frame_of_model
+from splatseed.training.config import without_dropped
 from splatseed.training.depths import ImageDepths, known_depths
 from splatseed.training.device import pick_device
+from splatseed.training.folder import config_of
 from splatseed.training.parameters import make_parameters
 from splatseed.training.settings import TrainSettings
 from splatseed.training.start import read_start
@@ -82,7 +84,8 @@ def floaters_of_model(
         ParameterError: A number is out of range.
     """
     settings = TrainSettings(strategy="grow", data_factor=data_factor or 1, test_every=test_every)
-    scene = with_photographs(with_masks(load_scene(scene_path, require_points=False), masks))
+    scene = without_dropped(load_scene(scene_path, require_points=False), config_of(path))
+    scene = with_photographs(with_masks(scene, masks))
     images = photographed(scene, test_every, without="leave `clean` out")
     gaussians = read_start(path, scene, lambda _: None)
     if data_factor is None:

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float32
 
 from splatseed.checkup.examination import with_fitting_points
-from splatseed.checkup.wrong_poses import without_wrong_poses
+from splatseed.checkup.wrong_poses import leave_out, without_wrong_poses
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.findings import Finding
 from splatseed.io import load_scene
@@ -114,17 +114,14 @@ def prepare_run(
     triangulated = posed.points is not scene.points  # else refinement keeps them
     if settings.start is None:
         posed = with_colors(posed, settings.test_every, note, progress)
+    checked = _checked_up(posed, setup)
     scene, stereo = seeded(
-        _checked_up(posed, setup),
-        settings,
-        setup.device.type,
-        note,
-        progress,
-        triangulated=triangulated,
+        checked, settings, setup.device.type, note, progress, triangulated=triangulated
     )
     initial = _initial(scene, setup)
     frame = initial.frame(scene, settings)
-    config = _checked_config(scene, initial, frame, setup)
+    dropped = [image.name for image in posed.images if image.name not in checked]
+    config = _checked_config(scene, initial, frame, setup, dropped)
     views = load_split(
         scene,
         data_factor=settings.factor,
@@ -194,10 +191,13 @@ def _checked_up(scene: Scene, setup: _Setup) -> Scene:
 
     Photographs with wrong poses are left out if the settings say so.
     """
-    if setup.settings.drop_wrong_poses:
+    wrong: tuple[Finding, ...] = ()
+    if setup.earlier:
+        scene, wrong = leave_out(scene, setup.earlier.get("dropped") or ())
+    elif setup.settings.drop_wrong_poses:
         scene, wrong = without_wrong_poses(scene, setup.progress)
-        for finding in wrong:
-            setup.note(finding)
+    for finding in wrong:
+        setup.note(finding)
     if was_upsampled(scene):  # which examined the points
         return scene
     settings, unfit_points = setup.settings, setup.settings.unfit_points
@@ -258,7 +258,11 @@ class _Start:
 
 
 def _checked_config(
-    scene: Scene, initial: _Seeds | _Start, frame: TrainingFrame, setup: _Setup
+    scene: Scene,
+    initial: _Seeds | _Start,
+    frame: TrainingFrame,
+    setup: _Setup,
+    dropped: Collection[str],
 ) -> dict[str, Any]:
     """Return the content of config.json, once it fits the memory and the run to resume."""
     for stray in stray_findings(frame.strays):
@@ -266,8 +270,9 @@ def _checked_config(
     facts, device = initial.facts, setup.device
     check_fits(facts["count"], device)
     config = make_config(
-        scene, facts, setup.settings, device_name(device), frame, refine_poses=setup.refine_poses
-    )
+        scene, facts, setup.settings, device_name(device), frame,
+        refine_poses=setup.refine_poses, dropped=dropped,
+    )  # fmt: skip
     if setup.earlier:
         check_same_input(setup.folder, setup.earlier, config)
     return config

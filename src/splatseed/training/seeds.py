@@ -21,7 +21,8 @@ from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Note, Progress
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Scene
-from splatseed.seeding.advice import AS_IT_IS, advice_for
+from splatseed.seeding.advice import AS_IT_IS, MIN_ROOM, advice_for
+from splatseed.seeding.diagnostics import empty_regions
 from splatseed.seeding.photo_methods import Auto
 from splatseed.seeding.thinning import thin
 from splatseed.seeding.upsampling import upsample_checked
@@ -54,13 +55,18 @@ def seeded(
         note(Finding("seeds-of-test-views", f"{text}`auto.test_every=8`."))
     if settings.seeding == "scene" or no_seeding_reason(scene, settings):
         return scene, None
+    why = ""
     if settings.seeding == "advised" and not triangulated:
         limit = settings.max_seeds(settings.cap or BUDGET)
-        advice = advice_for(scene, limit, why_no_seeds=settings.traits.why_no_seeds)
+        why_not, room = settings.traits.why_no_seeds, len(scene.points) * MIN_ROOM <= limit
+        regions = empty_regions(scene, progress) if why_not and room else None
+        empty = None if regions is None else regions.mean
+        advice = advice_for(scene, limit, why_no_seeds=why_not, empty=empty)
         if advice.method == AS_IT_IS:
             text = f"Seeds: {advice.sentence}. {advice.reasons[-1]}"
             note(Finding("seeds", text, "info"))
             return scene, None
+        why = f" {advice.reasons[-1]}" if len(scene.points) else ""
     start = time.perf_counter()
     size = stereo_size(scene.split(settings.test_every)[0], settings, device)
     stereo: list[StereoResult] = []
@@ -78,7 +84,7 @@ def seeded(
         alternative = "`seeding='scene'` starts from the scene's points alone."
     guessed = np.count_nonzero(cloud.source == source_code("cover"))
     made = f"{made}, {guessed:,} of them guessed from neighbours"
-    text = f"Seeds by method auto: {made}, in {time.perf_counter() - start:.0f} s."
+    text = f"Seeds by method auto: {made}, in {time.perf_counter() - start:.0f} s.{why}"
     note(Finding("seeds", text, "info", fix=alternative))
     return scene.replace(points=cloud), stereo[0] if stereo else None
 

@@ -22,7 +22,13 @@ from splatseed.photos.view import View
 from splatseed.runtime.interruption import interruption
 from splatseed.runtime.workarounds import keep_freed_memory
 from splatseed.splat.metrics import mirrored_ssim, psnr
-from splatseed.splat.photographs import PhotographCache, fill_masked, mask_tensor, photograph_tensor
+from splatseed.splat.photographs import (
+    PhotographCache,
+    fill_masked,
+    mask_tensor,
+    over_background,
+    photograph_tensor,
+)
 from splatseed.splat.rendering import render_view
 from splatseed.splat.ssim import l1_and_ssim, l1_and_ssim_by_convolution
 from splatseed.training.folder import Record
@@ -106,11 +112,16 @@ class Trainer:
         order = _epoch_order(self.settings.seed, epoch, len(self.train_views))
         index = int(order[position])
         view = self.train_views[index]
-        photograph = self._photographs.get(view)
+        photograph, background = self._photographs.get(view), None
+        if view.opacity is not None and state.exposures is None:
+            # On one background its colour could pass for an object, and the object for nothing.
+            background = torch.rand(3).to(self.device, non_blocking=True)
+            photograph = over_background(photograph, view, background)
         # The recorded loss and PSNR are with dropout.
         sparse = len(self.train_views) <= MAX_DROPOUT_VIEWS
         shown = with_dropout(params, schedule.dropout_at(step)) if sparse else params
-        plain, info = render_view(shown, view, schedule.sh_degree(step, self.settings.sh_degree))
+        degree = schedule.sh_degree(step, self.settings.sh_degree)
+        plain, info = render_view(shown, view, degree, background)
         render, mask = plain, mask_tensor(view, self.device)
         if state.exposures is not None:
             state.exposures.fit(index, plain, photograph, mask)

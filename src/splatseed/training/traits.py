@@ -48,7 +48,8 @@ class StrategyTraits:
     first_opacity: float = 0.1  # of a seed's Gaussian
     first_size: float = 1.0  # in 3DGS's conventions: its size, as a multiple of the gap to others
     why_no_seeds: str = ""
-    """Why ``train`` adds no seeds, and ``info`` advises none; empty if more seeds help."""
+    """Why ``train`` adds no seeds, and ``info`` advises none, where points cover the pictures;
+    empty if more seeds help there, too."""
 
 
 _ALL = (
@@ -64,10 +65,9 @@ _ALL = (
         in_3dgs=False,
         round_steps=GROW_EVERY,
         full_at=FULL_AT,
-        why_no_seeds="Strategy grow puts new Gaussians at the depth that stereo finds; adding "
-        "points by method auto first gained or lost 0.3 dB at most on all but one of the captures "
-        "measured. Under 3DGS's densification, which other trainers use, that gained 0.2 dB on "
-        "average: splatseed upsample adds them.",
+        why_no_seeds="Strategy grow puts new Gaussians at the depth that stereo finds. 3DGS's "
+        "densification, which other trainers use, does not: for them splatseed upsample adds "
+        "points.",
     ),
     StrategyTraits(
         "mcmc",

@@ -33,7 +33,7 @@ from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.model_frame import move_to_scene_origin, scene_from_model, transform_gaussians
 from splatseed.splat.training_frame import TrainingFrame, frame_of_model
 from splatseed.text import quoted
-from splatseed.training.config import has_run_poses
+from splatseed.training.config import has_run_poses, without_dropped
 from splatseed.training.folder import RunFolder
 from splatseed.viewer.page import font, latin
 
@@ -162,10 +162,11 @@ def _in_scene(
 
 def scene_of_run(folder: RunFolder) -> Scene | None:
     """Read the scene that a run's config names; None if it cannot be read."""
-    own = folder.scene_of(folder.read_config())
+    config = folder.read_config()
+    own = folder.scene_of(config)
     if own is not None:
         with suppress(SceneNotFoundError, SceneFormatError):  # it was moved or deleted
-            return load_scene(Path(own), require_points=False)
+            return without_dropped(load_scene(Path(own), require_points=False), config)
     return None
 
 
