@@ -1,4 +1,4 @@
-"""What the conventions of scores are worth: the formulas of other trainers' scripts on our pictures.
+"""What the conventions of scores are worth: other trainers' formulas on our pictures.
 
 Each function below is typed from the script that its docstring names, as it was on the date given;
 render x and photograph y are float [H, W, 3] in about [0, 1]. The table shows the mean over the
