@@ -30,6 +30,10 @@ from splatseed.pointcloud import PointCloud
 NO_POINT = -1
 """Point id of a feature without a point."""
 
+Color = tuple[int, int, int]
+"""Red, green and blue, 0 to 255, sRGB."""
+BLACK: Color = (0, 0, 0)
+
 OPENCV = "with OpenCV's camera axes (x right, y down, z forward)"
 OPENGL = "with OpenGL's camera axes (x right, y up, z back)"
 
@@ -76,6 +80,7 @@ class Image:
     folder: Path | None = None  # the images folder; None for a scene without one
     white: int = 65535  # the value of white in 16-bit photographs
     masks: Masks | None = None  # which pixels of the scene's photographs do not count
+    background: Color = BLACK  # over which transparent pixels are composited
 
     def __post_init__(self) -> None:
         _freeze(self, "quat", "translation")
@@ -143,8 +148,8 @@ class Image:
     def read(self) -> UInt8[np.ndarray, "H W 3"]:
         """Read the photograph, sRGB, as stored: not rotated by EXIF, resized or undistorted.
 
-        Transparent pixels are composited over black; where masks leave them out, those below half
-        of the full alpha are black and the others opaque.
+        Transparent pixels are composited over the background; where masks leave them out, those
+        below half of the full alpha have its colour and the others are opaque.
 
         Raises:
             SceneNotFoundError: There is no such file.
@@ -152,7 +157,9 @@ class Image:
         """
         from splatseed.io.photograph import read_photograph
 
-        return read_photograph(self.path, self.white, composited=self.shows_empty_space)
+        return read_photograph(
+            self.path, self.white, composited=self.shows_empty_space, background=self.background
+        )
 
     def read_mask(self, factor: int = 1) -> Bool[np.ndarray, "h w"] | None:
         """Read which pixels of the photograph count; None if all do.
@@ -184,7 +191,7 @@ class Image:
 
     @property
     def shows_empty_space(self) -> bool:
-        """Whether transparent pixels, if there are any, count: as black, empty space."""
+        """Whether transparent pixels, if there are any, count: as background, empty space."""
         return self.masks is None or not self.masks.alpha
 
     @cached_property
@@ -193,11 +200,16 @@ class Image:
         lens = self.lens
         return Camera(lens.K, lens.width, lens.height, self.cam_from_world)
 
-    def with_photograph(self, folder: Path | None, white: int, masks: Masks | None) -> Image:
-        """Return the image with the folder, the white value and the masks of its scene."""
-        if (self.folder, self.white, self.masks) == (folder, white, masks):
+    def with_photograph(
+        self, folder: Path | None, white: int, masks: Masks | None, background: Color
+    ) -> Image:
+        """Return the image with the folder, white value, masks and background of its scene."""
+        known = (self.folder, self.white, self.masks, self.background)
+        if known == (folder, white, masks, background):
             return self
-        return dataclass_replace(self, folder=folder, white=white, masks=masks)
+        return dataclass_replace(
+            self, folder=folder, white=white, masks=masks, background=background
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,6 +341,7 @@ class Scene:
         str, ...
     ] = ()  # names of images left out; they keep their place in ``test_every``
     white: int = 65535  # the value of white in photographs of 16 bits a channel
+    background: Color = BLACK  # of renders, over which transparent pixels are composited
     origin: Float64[np.ndarray, " 3"] = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
@@ -338,7 +351,7 @@ class Scene:
             object.__setattr__(self, "depths", maps_by_name(self.depths, names, distorted))
         if self.points.original_idx is not None:  # from here on, rows count in this cloud
             object.__setattr__(self, "points", self.points.replace(original_idx=None))
-        of_scene = self.source.image_dir, self.white, self.masks
+        of_scene = self.source.image_dir, self.white, self.masks, self.background
         images = tuple(image.with_photograph(*of_scene) for image in self.images)
         object.__setattr__(self, "images", images)
 

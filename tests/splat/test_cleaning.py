@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from splatseed.errors import SceneFormatError
-from splatseed.splat.formats import FORMATS, read_gaussians, write_gaussians
+from splatseed.splat.formats import WRITTEN_SUFFIXES, read_gaussians, write_gaussians
 from splatseed.splat.gaussians import Gaussians
 
 from .compressed import write_any
 
-SUFFIXES = [each.suffix for each in FORMATS.values()]
+SUFFIXES = [".compressed.ply", *WRITTEN_SUFFIXES]
 BAD = [
     *((name, value) for name in ("means", "quats", "sh0", "shN") for value in (np.nan, -np.inf)),
     *(("scales", value) for value in (np.nan, np.inf, 89.0)),  # e^89 is beyond float32

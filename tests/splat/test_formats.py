@@ -19,14 +19,14 @@ from hypothesis import given, settings, strategies as st
 from splatseed.camera import rotation_from_quat
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError, SplatseedError
 from splatseed.similarity import Similarity
-from splatseed.splat.formats import FORMATS, read_gaussians, write_gaussians
+from splatseed.splat.formats import WRITTEN_SUFFIXES, read_gaussians, write_gaussians
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.model_frame import transform_gaussians
 from splatseed.splat.sog import _MAX_META
 
 from .compressed import encode, write_any
 
-SUFFIXES = [each.suffix for each in FORMATS.values()]
+SUFFIXES = [".compressed.ply", *WRITTEN_SUFFIXES]
 # Of positions, log-scales, degrees of rotation, opacities, first and further coefficients.
 LIMITS = {
     ".ply": (0, 0, 0, 0, 0, 0),

@@ -15,6 +15,7 @@ from splatseed.findings import Finding
 from splatseed.io.staging import check_output, output_folder, write_json
 from splatseed.photos.view import View
 from splatseed.requirements import require
+from splatseed.splat.background import name_background
 from splatseed.text import counted
 from splatseed.training.folder import RunFolder
 from splatseed.training.request import AS_TRAINED, EvaluateRequest
@@ -36,7 +37,7 @@ class Options:
 
     model: Annotated[Path, tyro.conf.Positional]
     """A run folder of splatseed train, or a file of Gaussians from any trainer: .ply, .spz, .sog,
-    .splat."""
+    .splat, .glb, or a checkpoint of gsplat, nerfstudio or graphdeco."""
     scene: Path | None = None
     """The scene the model belongs to, in the same world; a run knows its own."""
     request: Annotated[EvaluateRequest, tyro.conf.arg(name="")] = AS_TRAINED
@@ -92,6 +93,7 @@ def run(arguments: list[str]) -> None:
         ("Gaussians", f"{result.num_gaussians:,}"),
         ("size", f"{(result.model_bytes or 0) / 1e6:.1f} MB of parameters"),
         ("data factor", f"{model.data_factor}"),
+        ("background", name_background(model.scene.background)),
     ]
     written = (("scores", options.output), ("renders", options.renders))
     facts += [(label, str(path)) for label, path in written if path is not None]
@@ -124,6 +126,7 @@ def _score(
             "scene": evaluation.scene,
             "data_factor": model.data_factor,
             "test_every": evaluation.test_every,
+            "background": name_background(model.scene.background),
             **result.to_dict(),
         }
         if findings := evaluation.findings(model):

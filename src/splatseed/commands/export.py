@@ -136,7 +136,7 @@ def run(arguments: list[str]) -> None:
         ("output", str(target)),
     ]
     print_pairs("splatseed export", rows)
-    print_note(*findings, *_format_findings(job, gaussians), *_loss_findings(loss, stages, job))
+    print_note(*findings, *_format_findings(job), *_loss_findings(loss, stages, job))
     _print_next(job)
 
 
@@ -310,7 +310,7 @@ def _loss(
         frame = frame_of_model(around, NO_POINTS, models[0])
         return measure_loss(models, around, frame, device, progress)
     test = [replace(view, photograph=NO_PIXELS) if cropped else view for view in views.test]
-    return measure_loss(models, test, views.frame, device, progress)
+    return measure_loss(models, test, views.frame, device, progress, views.background)
 
 
 def _loss_rows(
@@ -336,16 +336,13 @@ def _loss_findings(
     return [found] if found else []
 
 
-def _format_findings(job: _Job, gaussians: Gaussians) -> list[Finding]:
-    """Return what the formats of the file read and of the file written do to a model."""
+def _format_findings(job: _Job) -> list[Finding]:
+    """Return what is to be known of the format of the file read."""
     findings = []
     if job.path.suffix.lower() == ".spz" != job.options.output.suffix.lower():
         text = "The axes of the .spz were read as right, up, back, as specified."
         fix = "If the result is upside down, they had not been converted (docs/models.md)."
         findings.append(Finding("spz-axes", text, "info", fix=fix))
-    if job.format == "splat" and gaussians.shN.size:
-        text = "A .splat has no view-dependent colour: the model's is left out."
-        findings.append(Finding("unused-harmonics", text))
     return findings
 
 

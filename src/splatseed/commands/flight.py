@@ -98,7 +98,7 @@ def run(arguments: list[str]) -> None:
         views, fps = _path(options, items[0], size)
         clock("prepare", 0.0)
         device, frame = pick_device(options.backend, clock), viewer_frame(items[0])
-        renderers = [ModelRenderer(item.model, frame, device) for item in items]
+        renderers = [ModelRenderer(i.model, frame, device, i.background) for i in items]
         names = [item.name for item in items]
         frames = flight_frames(renderers, names, views, depth=options.depth, progress=clock)
         write_video(options.output, frames, size, fps)

@@ -194,7 +194,8 @@ def _show(options: Options, scene: Scene, facts: _Facts) -> None:
 
 def _shows_model(options: Options) -> bool:
     """Print what is in trained Gaussians; returns False for a scene."""
-    if not options.scene.is_file() and not RunFolder(options.scene).is_run:
+    scene = options.scene  # of other folders nothing is imported
+    if not (scene.is_file() or RunFolder(scene).is_run or (scene / "meta.json").is_file()):
         return False
     from splatseed.commands.model_info import is_model, show_model
 

@@ -18,7 +18,13 @@ from splatseed.console import OUT, print_note, print_pairs
 from splatseed.findings import Finding
 from splatseed.io.files import read_bytes
 from splatseed.io.origin import format_offset, offset_beside
-from splatseed.splat.formats import FORMATS, detect_format, holds_gaussians, read_gaussians
+from splatseed.splat.formats import (
+    FORMATS,
+    detect_format,
+    holds_gaussians,
+    read_gaussians,
+    unpacked_model,
+)
 from splatseed.splat.gaussians import VISIBLE_LOGIT, Gaussians
 from splatseed.text import quoted
 from splatseed.training.folder import RunFolder, config_of, model_file
@@ -28,7 +34,9 @@ PERCENTILES = (5, 25, 50, 75, 95)
 
 def is_model(path: Path) -> bool:
     """Whether a path is a run, or a file of Gaussians."""
-    return RunFolder(path).is_run or (path.is_file() and holds_gaussians(path))
+    if path.is_file():
+        return holds_gaussians(path)
+    return RunFolder(path).is_run or unpacked_model(path) is not None
 
 
 def show_model(path: Path, *, as_json: bool = False) -> None:

@@ -141,7 +141,8 @@ def _with_transparency(masks: Masks, paths: Sequence[Path]) -> tuple[Masks, list
     alike = {each.shape for each in pixels} == {pixels[0].shape}
     changing = np.any(pixels, axis=0) & ~np.all(pixels, axis=0) if alike else np.ones(1, np.bool_)
     if not masks.alpha or (np.median(shares) >= _CUT_OUT and changing.mean() >= _CHANGING):
-        text = f"{share}, are empty space: black in training and in scores."
+        text = f"{share}, are empty space: as the background, black unless said otherwise, in "
+        text += "training and in scores."
         fix = f"`masks={ALPHA!r}` leaves them out of both."
         return replace(masks, alpha=False), [Finding(TRANSPARENT, text, "info", fix=fix)]
     text = f"{share}, are left out of training and of scores."

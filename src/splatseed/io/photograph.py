@@ -1,9 +1,10 @@
 """Read photographs: bytes, size and pixels.
 
 Promise: pixels are as stored, without EXIF rotation, as in COLMAP; transparent pixels are
-composited over black, the background of renders, or, where they are masked, black up to half of
-the full alpha and of their own colour from there on; 16 bits per channel and floats in [0, 1] are
-rounded to 8 bits, with the capture's *white* (``io.picture``) as 255.
+composited over the background of renders, which is black but for models of trainers with another,
+or, where they are masked, of the background up to half of the full alpha and of their own colour
+from there on; 16 bits per channel and floats in [0, 1] are rounded to 8 bits, with the capture's
+*white* (``io.picture``) as 255.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from splatseed.findings import Finding
 from splatseed.io.files import read_bytes, similar_name, translate_errors
 from splatseed.io.picture import WHITE, is_16_bit, opaque_value, open_picture, read_16_bit
 from splatseed.runtime.fingerprint import fingerprint
-from splatseed.scene import Image, Scene
+from splatseed.scene import BLACK, Color, Image, Scene
 
 _CHECK_SCALE = 8
 """JPEGs are checked at 1/8 of their size: all bytes are read, few pixels are computed."""
@@ -83,11 +84,17 @@ def open_photograph(path: Path, encoded: bytes) -> PilImage.Image:
 
 
 def decode_photograph(
-    path: Path, encoded: bytes, white: int = WHITE, *, composited: bool = True
+    path: Path,
+    encoded: bytes,
+    white: int = WHITE,
+    *,
+    composited: bool = True,
+    background: Color = BLACK,
 ) -> PilImage.Image:
     """Decode a photograph to RGB; in 16 bits, ``white`` becomes 255.
 
-    Transparent pixels are ``composited`` over black, or black below ``OPAQUE`` and else opaque.
+    Transparent pixels are ``composited`` over the background, or of its colour below ``OPAQUE`` and
+    else opaque.
 
     Raises:
         SceneFormatError: No image, truncated or damaged, CMYK or LAB, or of unknown value range.
@@ -100,16 +107,18 @@ def decode_photograph(
             fix="Export it as sRGB: CMYK and LAB colours depend on a profile.",
         )
     if photograph.mode.startswith(_WIDE_GREY):
-        return _grey_of(path, photograph, white).convert("RGB")
+        return _grey_of(path, photograph, white, background)
     with translate_errors(path, _COMPLETE_IMAGE, fix=COPY_AGAIN):
         if is_16_bit(photograph):
-            return _colors_of(read_16_bit(encoded), photograph, white, composited=composited)
+            return _colors_of(
+                read_16_bit(encoded), photograph, white, background, composited=composited
+            )
         if has_alpha(photograph):
-            black = PilImage.new("RGBA", photograph.size, (0, 0, 0, 255))
+            behind = PilImage.new("RGBA", photograph.size, (*background, 255))
             shown = photograph.convert("RGBA")
             if not composited:
                 shown.putalpha(shown.getchannel("A").point(lambda alpha: 255 * (alpha >= OPAQUE)))
-            return PilImage.alpha_composite(black, shown).convert("RGB")
+            return PilImage.alpha_composite(behind, shown).convert("RGB")
         if photograph.mode == "RGB":  # converting would copy it, which takes as long as decoding
             photograph.load()
             return photograph
@@ -117,13 +126,17 @@ def decode_photograph(
 
 
 def read_photograph(
-    path: Path, white: int = WHITE, *, composited: bool = True
+    path: Path, white: int = WHITE, *, composited: bool = True, background: Color = BLACK
 ) -> UInt8[np.ndarray, "H W 3"]:
     """The pixels of a file, at its size; errors as ``photograph_bytes`` and ``decode_photograph``.
 
-    ``white`` is the value that becomes 255 in a file of 16 bits a channel; ``composited`` as there.
+    ``white`` is the value that becomes 255 in a file of 16 bits a channel; ``composited`` and
+    ``background`` as there.
     """
-    return np.array(decode_photograph(path, photograph_bytes(path), white, composited=composited))
+    encoded = photograph_bytes(path)
+    return np.array(
+        decode_photograph(path, encoded, white, composited=composited, background=background)
+    )
 
 
 def read_transparent(path: Path) -> Bool[np.ndarray, "H W"] | None:
@@ -160,9 +173,14 @@ def check_photograph(path: Path) -> tuple[int, int]:
 
 
 def _colors_of(
-    values: UInt16[np.ndarray, "H W C"], photograph: PilImage.Image, white: int, *, composited: bool
+    values: UInt16[np.ndarray, "H W C"],
+    photograph: PilImage.Image,
+    white: int,
+    background: Color,
+    *,
+    composited: bool,
 ) -> PilImage.Image:
-    """Convert 16-bit colours or grey to RGB over black."""
+    """Convert 16-bit colours or grey to RGB over the background."""
     channels = values.shape[-1]
     colors = values[..., : channels - (channels in _WITH_ALPHA)]
     shown = np.minimum(colors.astype(np.float32) * np.float32(255 / white), 255)
@@ -170,16 +188,18 @@ def _colors_of(
         opacity = values[..., -1] / np.float32(opaque_value(values[..., -1]))
         if not composited:
             opacity = (opacity >= OPAQUE / 255).astype(np.float32)
-        shown *= opacity[..., None]
+        shown = shown * opacity[..., None] + (1 - opacity[..., None]) * np.float32(background)
     transparent = photograph.info.get("transparency")
     if isinstance(transparent, tuple):
-        shown[(colors == transparent).all(axis=-1)] = 0
+        shown[(colors == transparent).all(axis=-1)] = background
     pixels = np.rint(shown).astype(np.uint8)
     return PilImage.fromarray(np.ascontiguousarray(np.broadcast_to(pixels, (*pixels.shape[:2], 3))))
 
 
-def _grey_of(path: Path, photograph: PilImage.Image, white: int) -> PilImage.Image:
-    """Convert 16-bit or float grey to 8 bits."""
+def _grey_of(
+    path: Path, photograph: PilImage.Image, white: int, background: Color
+) -> PilImage.Image:
+    """Convert 16-bit or float grey to RGB."""
     with translate_errors(path, _COMPLETE_IMAGE, fix=COPY_AGAIN):
         values = np.asarray(photograph)
     limit = 1.0 if photograph.mode == "F" else 65535.0
@@ -193,10 +213,11 @@ def _grey_of(path: Path, photograph: PilImage.Image, white: int) -> PilImage.Ima
         )
     scale = np.float32(255 / (1.0 if photograph.mode == "F" else white))
     grey = np.rint(np.minimum(values.astype(np.float32) * scale, 255)).astype(np.uint8)
+    pixels = np.repeat(grey[..., None], 3, axis=2)
     transparent = photograph.info.get("transparency")
     if transparent is not None:
-        grey[values == transparent] = 0
-    return PilImage.fromarray(grey)
+        pixels[values == transparent] = background
+    return PilImage.fromarray(pixels)
 
 
 def lens_findings(images: Sequence[Image]) -> list[Finding]:

@@ -38,7 +38,7 @@ from splatseed.photos.view import View
 from splatseed.progress import Progress, silent
 from splatseed.projection import scaled
 from splatseed.runtime.memory import check_memory
-from splatseed.scene import Image, Scene
+from splatseed.scene import BLACK, Color, Image, Scene
 
 FILTER = "box-4"  # part of the cache's key: change it whenever downsampling changes
 READERS = 4  # threads that decode photographs
@@ -149,8 +149,9 @@ def _load_view(
     photograph = _load_draft(image.path, data_factor) if draft else None
     if photograph is None:
         photograph = load_photograph(
-            image.path, data_factor, cache_dir, image.white, composited=image.shows_empty_space
-        )
+            image.path, data_factor, cache_dir, image.white,
+            composited=image.shows_empty_space, background=image.background,
+        )  # fmt: skip
     height, width = photograph.shape[:2]
     check_side(image.path, min_side, data_factor, (width, height))
     lens = image.lens
@@ -196,10 +197,11 @@ def load_photograph(
     white: int = WHITE,
     *,
     composited: bool = True,
+    background: Color = BLACK,
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Read a photograph, downsampled by ``factor``.
 
-    Transparent pixels are ``composited`` over black, the background of renders, as
+    Transparent pixels are ``composited`` over the background of renders, as
     ``io.photograph.decode_photograph`` has it. Smaller copies are cached in ``cache_dir``, if there
     is one.
     """
@@ -210,11 +212,12 @@ def load_photograph(
         )
     encoded = photograph_bytes(path)
     digest = hashlib.blake2b(encoded, digest_size=16, person=FILTER.encode()).hexdigest()
-    file_name = f"{digest}_{factor}_{white}{'_composited' * composited}.npz"
+    behind = "_composited" * composited + "".join(f"_{c}" for c in background if any(background))
+    file_name = f"{digest}_{factor}_{white}{behind}.npz"
     kept = None if cache_dir is None or factor == 1 else cache_dir / file_name
     if kept is not None and (known := _read(kept)) is not None:
         return known
-    original = decode_photograph(path, encoded, white, composited=composited)
+    original = decode_photograph(path, encoded, white, composited=composited, background=background)
     width, height = original.width // factor, original.height // factor
     check_side(path, 1, factor, (width, height))
     photograph = original

@@ -37,9 +37,10 @@ from splatseed.photos.loading import load_views
 from splatseed.photos.sizes import default_factor
 from splatseed.photos.view import View, camera_views
 from splatseed.progress import Progress, silent
-from splatseed.scene import Scene
+from splatseed.scene import BLACK, Color, Scene
 from splatseed.scores import NOT_REQUESTED, EvalResult, ViewScore
 from splatseed.splat._kernels import WINDOW
+from splatseed.splat.background import WHITE, background_of
 from splatseed.splat.formats import read_gaussians
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.lpips import LPIPS_NET, Lpips
@@ -61,6 +62,8 @@ Covisible: TypeAlias = Mapping[str, Bool[np.ndarray, "H W"]]
 Render: TypeAlias = Callable[[View], Float[Tensor, "H W 3"]]
 OnView: TypeAlias = Callable[[View, Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]], None]
 """Called with each view, its render clamped to [0, 1], and FLIP of each pixel."""
+_COMPARED, _DIFFERENCE = 2, 1.0
+"""Test views on which black and white are compared as backgrounds, and the decibels that matter."""
 
 
 @torch.no_grad()
@@ -184,6 +187,7 @@ def load_model(
     masks: str | None = None,
     trained_on: str | None = None,
     near_plane: float | None = None,
+    background: str | None = None,
     device: torch.device | None = None,
     cache_dir: Path | None = None,
     progress: Progress = silent,
@@ -201,6 +205,8 @@ def load_model(
         trained_on: The ``photographs_digest`` of the run; if it equals the scene's, the frame is
             known to be right and not checked.
         near_plane: The run's, in the model's units; by default computed from the scene.
+        background: Behind renders and transparent pixels, as for ``parse_background``; by default
+            what the model's trainer recorded, else black.
         device: The device to render on, by default the CPU.
         cache_dir: A folder in which to cache downsampled photographs; by default none.
         progress: Called with the name of a stage and its fraction done.
@@ -218,6 +224,8 @@ def load_model(
     if not isinstance(scene, Scene):
         scene = load_scene(Path(scene), require_points=False)
     scene = with_masks(scene, masks)
+    known = background_of(path, background, findings.append)
+    scene = scene.replace(background=known or BLACK)
     findings += [each for each in scene.findings if each.kind == TRANSPARENT]
     if scene.images:
         scene = _with_test_photographs(scene, test_every)
@@ -256,11 +264,46 @@ def load_model(
     )
     if near_plane is not None:
         frame = dataclasses.replace(frame, near=near_plane * frame.scale)
-    image = ModelRenderer(gaussians, frame, device).image
-    return TrainedModel(
-        gaussians, views, lambda view: image(view_in_model_frame(world, view)), scene, factor,
-        tuple(findings),
-    )  # fmt: skip
+
+    def renderer(background: Color) -> Render:
+        image = ModelRenderer(gaussians, frame, device, background).image
+        return lambda view: image(view_in_model_frame(world, view))
+
+    render = renderer(scene.background)
+    if known is None:
+        findings += _better_on_white(renderer, scene, views, factor)
+    return TrainedModel(gaussians, views, render, scene, factor, tuple(findings))
+
+
+def _better_on_white(
+    renderer: Callable[[Color], Render], scene: Scene, views: Sequence[View], data_factor: int
+) -> list[Finding]:
+    """Report a model without a record of its background whose renders fit better on white."""
+    few = ([view for view in views if view.empty is not None] or views)[:_COMPARED]
+    on_white = few
+    if few[0].empty is not None:
+        white = scene.replace(background=WHITE)
+        images = [white[view.name] for view in few]
+        on_white = load_views(white, images, data_factor=data_factor)
+    dark, bright = _mean_psnr(renderer(BLACK), few), _mean_psnr(renderer(WHITE), on_white)
+    if not bright > dark + _DIFFERENCE:
+        return []
+    text = "The model's background is not recorded, and its renders fit the photographs better on "
+    text += f"white ({bright:.1f} dB) than on black ({dark:.1f} dB)."
+    return [Finding("background", text, fix="Pass `background='white'` if it was trained on it.")]
+
+
+@torch.no_grad()
+def _mean_psnr(render: Render, views: Sequence[View]) -> float:
+    shown = [(view, render(view)) for view in views]
+    return float(
+        np.mean(
+            [
+                psnr(im, photograph_tensor(v, im.device), mask_tensor(v, im.device))
+                for v, im in shown
+            ]
+        )
+    )
 
 
 def _with_test_photographs(scene: Scene, test_every: int) -> Scene:

@@ -7,30 +7,48 @@ lose fine detail and the order of Gaussians.
 
 from __future__ import annotations
 
+import io
+import json
+import re
+import tempfile
+import zipfile
 import zlib
 from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 from splatseed.errors import ParameterError, SceneFormatError
-from splatseed.io.files import COPY_AGAIN, StrPath, read_bytes
+from splatseed.io.files import ARCHIVE_FAILURES, COPY_AGAIN, StrPath, read_bytes
 from splatseed.io.staging import atomic_file
 from splatseed.progress import Note, Progress, silent, silent_note
-from splatseed.splat import compressed_ply, model_ply, sog, splat_file, spz
+from splatseed.splat import (
+    checkpoint,
+    compressed_ply,
+    gltf,
+    gsplat_png,
+    model_ply,
+    sog,
+    splat_file,
+    spz,
+)
 from splatseed.splat.cleaning import drop_unusable
 from splatseed.splat.gaussians import Gaussians
-from splatseed.text import beginning, did_you_mean
+from splatseed.text import beginning, did_you_mean, name_some
 
 _HEADER = 1 << 20
-_MODEL_SUFFIXES = (".spz", ".splat", ".sog", ".ksplat", ".glb")
-_UNSUPPORTED = {
+_MODEL_SUFFIXES = (".spz", ".splat", ".sog", ".ksplat", *checkpoint.SUFFIXES)
+_UNWRITTEN = {
     ".ksplat": "GaussianSplats3D's own tool (util/create-ksplat.js) makes one from a .ply",
     ".glb": f"{sog.CONVERTER} MODEL.ply OUT.glb makes one from a .ply",
     ".gltf": f"{sog.CONVERTER} MODEL.ply OUT.glb makes a .glb from a .ply",
     ".usdz": "NVIDIA's converter (PyPI: usd-convert-gsplat) makes one from a .ply",
 }
-"""Unsupported formats, and tools that write them."""
+"""Formats that are not written, and tools that do."""
+_UNREAD = (".ksplat", ".lcc")
+"""Formats of Gaussians that are not read, but by the converter."""
+_JSON_FORMATS = {".json": "sog", ".gltf": "glb"}
+_SCALE_IN_PLY = re.compile(rb"[ _]scale_0\r?\n")
 
 
 class Format(NamedTuple):
@@ -61,6 +79,11 @@ FORMATS = {
         spz.decode, spz.encode,
     ),
     "sog": Format(".sog", "all but fine detail; PlayCanvas, SuperSplat", sog.decode, sog.encode),
+    "glb": Format(".glb", "everything; glTF's KHR_gaussian_splatting", gltf.decode),
+    "checkpoint": Format(
+        ".ckpt", "everything; the checkpoint of a trainer", checkpoint.decode
+    ),
+    "gsplat-png": Format("meta.json", "all but fine detail; gsplat", gsplat_png.decode),
 }  # fmt: skip
 """Formats by name; a suffix stands before those that it ends with."""
 SUFFIXES = {each.suffix: name for name, each in FORMATS.items()}
@@ -76,8 +99,9 @@ def read_gaussians(path: StrPath, note: Note = silent_note) -> Gaussians:
     """Read the Gaussians of any trainer.
 
     Args:
-        path: The folder of a run, or a .ply, compressed .ply, .splat, .spz, or .sog (or its
-            meta.json), recognised by its content.
+        path: The folder of a run or of gsplat's PNG compression, or a .ply, compressed .ply,
+            .splat, .spz, .sog (or its meta.json), .glb, or a checkpoint of gsplat, nerfstudio or
+            graphdeco, recognised by its content.
         note: Called with findings, such as Gaussians with NaN, which are left out.
 
     Returns:
@@ -86,13 +110,29 @@ def read_gaussians(path: StrPath, note: Note = silent_note) -> Gaussians:
     Raises:
         SceneNotFoundError: The file does not exist.
         SceneFormatError: The format is unknown, the file is damaged, or no Gaussian can be drawn.
-        MissingDependencyError: An .spz of version 4 needs zstandard.
+        MissingDependencyError: An .spz of version 4 needs zstandard, a checkpoint PyTorch.
     """
     path = Path(path)
     if path.is_dir():
-        path /= RUN_FILE
+        path = next((p for p in (path / RUN_FILE, unpacked_model(path)) if p and p.is_file()), path)
     gaussians = FORMATS[detect_format(path, read_bytes(path))].decode(path, note)
     return drop_unusable(path, gaussians, note)
+
+
+def unpacked_model(folder: Path) -> Path | None:
+    """Return the ``meta.json`` of an unpacked SOG, or of gsplat's PNGs, in a folder; else None."""
+    file = folder / sog.META
+    return file if file.is_file() and holds_gaussians(file) else None
+
+
+def round_trip(
+    gaussians: Gaussians, suffix: str, progress: Progress = silent, note: Note = silent_note
+) -> Gaussians:
+    """Return Gaussians as they are read after writing them in the format of a suffix."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"model{suffix}"
+        write_gaussians(path, gaussians, progress, note)
+        return read_gaussians(path)
 
 
 def write_gaussians(
@@ -125,14 +165,18 @@ def format_of_name(path: Path, more: Collection[str] = ()) -> str:
 
     ``more`` are suffixes that the caller handles, for the message.
     """
-    found, other = path.suffix or "none", _UNSUPPORTED.get(path.suffix.lower())
+    found, other = path.suffix or "none", _UNWRITTEN.get(path.suffix.lower())
     known = (*WRITTEN_SUFFIXES, *more)
     fix = f"Export a .ply: {other}." if other else f"{did_you_mean(found, known)}Choose one."
     for suffix, name in SUFFIXES.items():
         if path.name.lower().endswith(suffix):
             if suffix in known:
                 return name
-            found, fix = f"{suffix}, which is only read", "Write a .sog, its successor."
+            found = f"{suffix}, which is only read"
+            if not other:
+                fix = (
+                    "Write a .sog, its successor." if name == "compressed-ply" else "Write a .ply."
+                )
             break
     raise ParameterError(
         f"a file name that ends in one of {', '.join(known)}", found=found, fix=fix
@@ -141,16 +185,11 @@ def format_of_name(path: Path, more: Collection[str] = ()) -> str:
 
 def detect_format(path: Path, data: bytes) -> str:
     """Return the name of the format of a file's content (of a .splat, of its name)."""
+    if (name := _format_of_content(path, data)) is not None:
+        return name
     suffix = path.suffix.lower()
-    if data.startswith(b"ply") and data[3:4] in (b"\n", b"\r", b" ", b"\t"):
-        return "compressed-ply" if b"packed_position" in data[:_HEADER] else "ply"
-    start = data
-    with suppress(zlib.error):
-        start = zlib.decompressobj(wbits=31).decompress(data[:4096], 4)
-    if start.startswith(spz.MAGIC):
-        return "spz"
-    if data.startswith(b"PK\x03\x04") or (data[:1] == b"{" and suffix == ".json"):
-        return "sog"
+    if suffix in checkpoint.SUFFIXES:
+        return "checkpoint"
     found, fix = beginning(data), "Name a file of trained Gaussians."
     if suffix == ".splat":
         size = splat_file.RECORD.itemsize
@@ -158,11 +197,47 @@ def detect_format(path: Path, data: bytes) -> str:
             return "splat"
         found = f"{len(data):,} bytes, not a multiple of the {size} of a .splat's Gaussian"
         fix = COPY_AGAIN
-    elif suffix in _UNSUPPORTED:
+    elif suffix in _UNREAD:
         found = f"a {suffix}"
         fix = f"Export a .ply where it came from, or try {sog.CONVERTER} IN{suffix} OUT.ply."
+    elif suffix in _UNWRITTEN:
+        found, fix = f"a {suffix}", "Export a .ply where it came from."
     expected = f"{path} to hold trained Gaussians ({', '.join(SUFFIXES)})"
     raise SceneFormatError(expected, found=found, fix=fix)
+
+
+def _format_of_content(path: Path, data: bytes) -> str | None:
+    if data.startswith(b"ply") and data[3:4] in (b"\n", b"\r", b" ", b"\t"):
+        return "compressed-ply" if b"packed_position" in data[:_HEADER] else "ply"
+    if data.startswith(b"PK\x03\x04"):
+        return _format_of_archive(path, data)
+    if data.startswith(gltf.MAGIC):
+        return "glb"
+    if data[:1] == b"{" and path.suffix.lower() in _JSON_FORMATS:
+        name = _JSON_FORMATS[path.suffix.lower()]
+        with suppress(ValueError, RecursionError):
+            return "gsplat-png" if gsplat_png.is_gsplat_png(json.loads(data)) else name
+        return name
+    start = data
+    with suppress(zlib.error):
+        start = zlib.decompressobj(wbits=31).decompress(data[:4096], 4)
+    return "spz" if start.startswith(spz.MAGIC) else None
+
+
+def _format_of_archive(path: Path, data: bytes) -> str:
+    """Return the name of the format of a .zip: PyTorch's, or SOG, or what its suffix says."""
+    names: list[str] = []
+    with suppress(*ARCHIVE_FAILURES), zipfile.ZipFile(io.BytesIO(data)) as archive:
+        names = [PurePosixPath(name).name for name in archive.namelist()]
+    if "data.pkl" in names or (not names and path.suffix.lower() in checkpoint.SUFFIXES):
+        return "checkpoint"
+    if sog.META in names or not names:
+        return "sog"
+    raise SceneFormatError(
+        f"{path} to hold trained Gaussians ({', '.join(SUFFIXES)})",
+        found=f"an archive of {name_some(names, 3)}",
+        fix="Unpack it, and name the file of Gaussians in it.",
+    )
 
 
 def holds_gaussians(path: Path) -> bool:
@@ -172,8 +247,10 @@ def holds_gaussians(path: Path) -> bool:
     data = read_bytes(path)
     if path.suffix.lower() == ".json" and b'"means"' not in data[:_HEADER]:
         return False
+    if path.suffix.lower() in {".glb", ".gltf"}:
+        return gltf.EXTENSION.encode() in data[:_HEADER]
     try:
         kind = detect_format(path, data)
     except SceneFormatError:
         return False
-    return kind != "ply" or b" scale_0\n" in data[:_HEADER].replace(b"\r", b"")
+    return kind != "ply" or _SCALE_IN_PLY.search(data, 0, _HEADER) is not None

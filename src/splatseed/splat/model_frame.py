@@ -33,11 +33,12 @@ from splatseed.scene import Scene
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
 from splatseed.splat.gaussians import VISIBLE_LOGIT, Gaussians
 
-GSPLAT, FLIPPED, NO_TRANSFORM = "gsplat", "flipped", "none"
-"""Named transforms: that of gsplat's examples; y and z negated; none, without a check."""
+GSPLAT, FLIPPED, TURNED, NO_TRANSFORM = "gsplat", "flipped", "turned", "none"
+"""Named transforms: that of gsplat's examples; y and z, or x and y negated; none, unchecked."""
+_NEGATED = {FLIPPED: (1.0, -1.0, -1.0), TURNED: (-1.0, -1.0, 1.0)}
 FILES = (NERFSTUDIO, "cameras.json")
 """Files with a transform, in the model's folder or up to three above."""
-_FIX = "Name another file, gsplat, flipped or none."
+_FIX = "Name another file, gsplat, flipped, turned or none."
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ def find_transform(name: str, scene: Scene) -> Similarity | None:
     """Return the transform from the scene's to the model's frame.
 
     ``name`` is a file, ``gsplat`` (computed from the scene), ``flipped`` (y and z are negated, from
-    COLMAP's axes to OpenGL's) or ``none``, which gives None.
+    COLMAP's axes to OpenGL's), ``turned`` (x and y are, to glTF's) or ``none``, which gives None.
 
     Raises:
         SceneNotFoundError: The file does not exist.
@@ -80,8 +81,8 @@ def find_transform(name: str, scene: Scene) -> Similarity | None:
         return None
     if name == GSPLAT:
         return _gsplat_normalisation(scene)
-    if name == FLIPPED:
-        return _to_file_frame(scene).then(Similarity(1.0, np.diag([1.0, -1.0, -1.0]), np.zeros(3)))
+    if name in _NEGATED:
+        return _to_file_frame(scene).then(Similarity(1.0, np.diag(_NEGATED[name]), np.zeros(3)))
     path = Path(name)
     content = read_json(path, "a transform in JSON", fix=_FIX)
     if isinstance(content, list) and content and isinstance(content[0], dict):
@@ -135,12 +136,16 @@ def check_frame(
     if misfit is None or (found := misfit(given)) <= FRAME.good_misfit:
         return
     misfits = {name: misfit(world) for name, world in _candidates(path, scene).items()}
-    if found <= FRAME.max_misfit and found <= min(misfits.values()) * FRAME.ratio:
+    best = min(misfits, key=misfits.__getitem__)
+    if found <= FRAME.max_misfit and found <= misfits[best] * FRAME.ratio:
         note(
             Finding(
                 "uncertain-frame",
                 f"Points of the scene are {found:.1f} times as far from the nearest Gaussian as "
                 "Gaussians from each other: check the renders before you trust the scores.",
+                fix=f"If they are wrong, try `transform={best!r}`, which fits better."
+                if misfits[best] <= FRAME.good_misfit
+                else "",
             )
         )
         return
@@ -283,7 +288,7 @@ def _candidates(path: Path | None, scene: Scene) -> dict[str, Similarity | None]
     found: dict[str, Similarity | None] = {NO_TRANSFORM: None}
     folders = path.resolve().parents[:4] if path else ()
     files = [folder / file for folder in folders for file in FILES]
-    for name in (*(str(file) for file in files if file.is_file()), GSPLAT, FLIPPED):
+    for name in (*(str(file) for file in files if file.is_file()), GSPLAT, *_NEGATED):
         with suppress(SceneFormatError, ParameterError):
             found[name] = find_transform(name, scene)
     return found

@@ -1,15 +1,15 @@
 """Read and write Gaussians in .ply files: 3DGS's layout, and its variants by other trainers.
 
-``ply_layout`` has the layout. Properties are found by name, in any order and type; unknown ones are
-ignored. 3DGS's layout survives writing and reading bit for bit. Models that need a network or a
-time to be rendered are refused by name.
+``encode_layout`` has the layout. Properties are found by name, in any order and type, and with the
+prefixes of CloudCompare; unknown ones are reported or refused (``parameters``). 3DGS's layout
+survives writing and reading bit for bit.
 """
 
 from __future__ import annotations
 
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,20 +34,13 @@ from splatseed.splat.gaussians import (
     is_antialiased,
     rest_names,
 )
+from splatseed.splat.parameters import check_parameters, in_standard_units
 
 _COLORS = ("red", "green", "blue")
+_NORMALS = ("nx", "ny", "nz")
 _FILTER = "filter_3D"
-_UNSUPPORTED = {
-    "f_anchor_feat": "anchors (as of Scaffold-GS), from which networks generate Gaussians",
-    "f_offset": "anchors (as of Scaffold-GS), from which networks generate Gaussians",
-    "trbf_": "Gaussians that move and fade over time (as of Spacetime Gaussians)",
-    "motion_": "Gaussians that move over time (as of Spacetime Gaussians)",
-    "scaling_t": "Gaussians in space and time (4D Gaussian Splatting)",
-    "scale_t": "Gaussians in space and time (4D Gaussian Splatting)",
-    "sb_params": "Beta kernels (as of Deformable Beta Splatting), not Gaussians",
-    "f_asg": "colours computed by a network (as of Spec-Gaussian)",
-}
-"""Prefixes of properties of models that only their own program can render."""
+_SCALAR_FIELD = "scalar_"
+"""CloudCompare writes it before the names of all but positions, normals and colours."""
 FLATNESS = 1e-3
 """Thickness of a flat Gaussian, relative to its smaller size: far below a pixel."""
 _UNUSED = (24, 35)  # coefficients beyond the first of degrees 4 and 5
@@ -63,8 +56,10 @@ def encode(gaussians: Gaussians, _: Note = silent_note) -> list[bytes | memoryvi
 def decode(path: Path, note: Note = silent_note) -> Gaussians:
     """Decode the .ply of any trainer."""
     reader = ByteReader(path, EXPORT_PLY_AGAIN)
-    header = parse_header(path, reader.data)
+    header = _without_prefixes(parse_header(path, reader.data))
     names = {name for element in _up_to_vertices(header)[-1:] for name in element.types}
+    if names:
+        check_parameters(path, names, _known(names), note)
     _check(path, header, names, reader.data)
     rows = _rows(reader, header)
     arrays: dict[str, Any] = {
@@ -73,7 +68,11 @@ def decode(path: Path, note: Note = silent_note) -> Gaussians:
         "sh0": _first_colors(rows, names)[:, None],
         "shN": _harmonics(rows, names, note),
     }
-    arrays["scales"], arrays["quats"] = _shape(rows, names, note)
+    scales = _columns(rows, [name for name in SCALES if name in names])
+    scales, arrays["opacities"] = in_standard_units(
+        path, arrays["means"], scales, arrays["opacities"], note
+    )
+    arrays["scales"], arrays["quats"] = _shape(rows, scales, note)
     if _FILTER in names:
         sizes = _columns(rows, [_FILTER])[:, 0]
         arrays["scales"], arrays["opacities"] = filtered(
@@ -119,28 +118,44 @@ def _check(path: Path, header: Header, names: set[str], data: bytes) -> None:
     needed = [*XYZ, *(() if set(_COLORS) <= names else DC), *rest_names(rest), "opacity"]
     needed += ["scale_0", *(ROTATION if "scale_1" in names else ())]
     missing = [name for name in needed if name not in names]
-    kinds = (
-        f"{kind}: {name}"
-        for name in sorted(names)
-        for start, kind in _UNSUPPORTED.items()
-        if name.startswith(start)
-    )
     before = _up_to_vertices(header)
     count = before[-1].num_rows if before else 0
-    found, fix = next(kinds, ""), "Export it as plain Gaussians with the program that trained it."
-    if not found:
-        fix = "Name the point_cloud.ply of a training run, not the seeds or a mesh."
-        if missing:
-            found = f"no {', '.join(missing[:5])}"
-        elif any(element.has_lists for element in before):
-            found = f"the list property {b', '.join(_LIST.findall(data, 0, header.size)).decode()}"
-            fix = "Export it again without the list."
-        elif rest not in {3 * k for k in (*SH_COUNTS, *_UNUSED)} or not count:
-            found = f"{rest} f_rest properties and {count} vertices"
+    found, fix = "", "Name the point_cloud.ply of a training run, not the seeds or a mesh."
+    if missing:
+        found = f"no {', '.join(missing[:5])}"
+    elif any(element.has_lists for element in before):
+        found = f"the list property {b', '.join(_LIST.findall(data, 0, header.size)).decode()}"
+        fix = "Export it again without the list."
+    elif rest not in {3 * k for k in (*SH_COUNTS, *_UNUSED)} or not count:
+        found = f"{rest} f_rest properties and {count} vertices"
     if found:
         raise SceneFormatError(
             f"{path} to hold trained Gaussians in 3DGS's layout", found=found, fix=fix
         )
+
+
+def _known(names: set[str]) -> Iterator[str]:
+    """Yield the properties that are read, and those that neither colour nor shape depends on."""
+    yield from (*XYZ, *_NORMALS, *DC, *_COLORS, "alpha", "opacity", *SCALES, *ROTATION, _FILTER)
+    yield from rest_names(sum(name.startswith("f_rest_") for name in names))
+
+
+def _without_prefixes(header: Header) -> Header:
+    """Remove CloudCompare's prefixes, which it repeats each time that it writes a file."""
+    elements = []
+    for element in header.elements:
+        own = dict.fromkeys(_own_name(name) for name in element.types)
+        if len(own) == len(element.types):
+            types = dict(zip(own, element.types.values(), strict=True))
+            element = element._replace(types=types)  # noqa: PLW2901  (the same, with other names)
+        elements.append(element)
+    return header._replace(elements=tuple(elements))
+
+
+def _own_name(name: str) -> str:
+    while name.startswith(_SCALAR_FIELD):
+        name = name.removeprefix(_SCALAR_FIELD)
+    return name
 
 
 def _up_to_vertices(header: Header) -> list[Element]:
@@ -220,10 +235,9 @@ def _harmonics(rows: np.ndarray, names: set[str], note: Note) -> Float32[np.ndar
 
 
 def _shape(
-    rows: np.ndarray, names: set[str], note: Note
+    rows: np.ndarray, scales: Float32[np.ndarray, "N S"], note: Note
 ) -> tuple[Float32[np.ndarray, "N 3"], Float32[np.ndarray, "N 4"]]:
     """Return log-scales and rotations: spheres for one size, discs for two (as of 2DGS)."""
-    scales = _columns(rows, [name for name in SCALES if name in names])
     if scales.shape[1] == 1:
         text = "Gaussians have one size, scale_0: they are read as spheres."
         note(Finding("spheres-or-discs", text, "info"))

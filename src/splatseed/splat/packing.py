@@ -11,7 +11,7 @@ as large. Distant Gaussians are dropped if keeping them would cost more image qu
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -84,6 +84,7 @@ class PackingSettings:
     negligible_cost: float = 1e-3  # invisible: rounding positions by 3% of a Gaussian's size
     uniform_share: float = 0.1  # of the cost of a lost Gaussian; the rest follows its solid angle
     max_blur: float = 0.5  # cost of a misplaced Gaussian, relative to a lost one
+    visible: float = 1 / 64  # difference of a coefficient: about one of 255 steps of a colour
     coarse_error: float = 0.1  # median rounding error, in sizes, that the user should know of
     morton_bits: int = 21  # per axis; 63 in all
 
@@ -113,13 +114,14 @@ def shells_of(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
 def morton_order(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
     """Return the order of positions along a Z curve, in cells that grow with the distance.
 
-    Along each axis sign(x) log(1 + |x|), with x in reaches from the median, is divided evenly.
+    sign(x) log(1 + |x|), with x in reaches from the median, is divided evenly, in the same steps
+    along all axes: in a wide and flat model, neighbours along the curve are neighbours in space.
     """
     xyz = means.astype(np.float64)
     offsets = (xyz - np.median(xyz, axis=0)) / distances_of(means)[1]
     curved = np.sign(offsets) * np.log1p(np.abs(offsets))
-    low, high = curved.min(axis=0), curved.max(axis=0)
-    extent = np.where(high > low, high - low, 1)
+    low = curved.min(axis=0)
+    extent = float((curved.max(axis=0) - low).max()) or 1.0
     cells = ((curved - low) / extent * (2**PACKING.morton_bits - 1)).astype(np.uint64)
     code = np.zeros(len(xyz), np.uint64)
     for bit in range(PACKING.morton_bits):
@@ -127,6 +129,45 @@ def morton_order(means: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
             digit = (cells[:, axis] >> np.uint64(bit)) & np.uint64(1)
             code |= digit << np.uint64(3 * bit + axis)
     return np.argsort(code, kind="stable")
+
+
+def clipped_findings(
+    suffix: str,
+    gaussians: Gaussians,
+    *,
+    sizes: tuple[float, float] | None = None,
+    first: tuple[float, float] | None = None,
+    further: tuple[float, float] | None = None,
+) -> Iterator[Finding]:
+    """Yield findings on values that files with this suffix clip, by the ranges that they hold.
+
+    ``sizes`` are log-scales (the thickness of a flat Gaussian does not matter), ``first`` and
+    ``further`` coefficients of harmonics.
+    """
+    if sizes is not None:
+        axes = np.sort(gaussians.scales, axis=1)
+        beyond = (axes[:, 2] > sizes[1]) | (axes[:, 1] < sizes[0])
+        if number := int(np.count_nonzero(beyond)):
+            low, high = np.exp(sizes)
+            yield Finding(
+                "clipped-sizes",
+                f"A {suffix} holds sizes from {low:.2g} to {high:.4g} units: "
+                f"{counted(number, 'Gaussian')} {agreeing(number, 'was', 'were')} clipped.",
+            )
+    for what, values, limits in (
+        ("colours", gaussians.sh0, first), ("view-dependent colours", gaussians.shN, further)
+    ):  # fmt: skip
+        if limits is None:
+            continue
+        lost = np.maximum(values - limits[1], limits[0] - values).reshape(len(values), -1)
+        number = int(np.count_nonzero((lost > PACKING.visible).any(axis=1)))
+        if number:
+            yield Finding(
+                "clipped-colors",
+                f"A {suffix} holds {what} as harmonics from {limits[0]:.3g} to {limits[1]:.3g}: "
+                f"those of {counted(number, 'Gaussian')} of {len(values):,} lie beyond and were "
+                f"clipped, by up to {lost.max():.2g}, so that colours fade.",
+            )
 
 
 class Fit(NamedTuple):

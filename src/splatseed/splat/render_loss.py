@@ -17,6 +17,7 @@ import torch
 from splatseed.findings import Finding
 from splatseed.photos.view import View
 from splatseed.progress import Progress, silent
+from splatseed.scene import BLACK, Color
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.metrics import psnr
 from splatseed.splat.photographs import mask_tensor, photograph_tensor
@@ -28,8 +29,8 @@ MAX_LOST, MIN_LIKENESS = 0.3, 40.0
 """Packed files that lose more than the first number of dB against photographs, or whose renders
 have less than the second against the model's, are reported. Renders at 40 dB cost a model of 30 dB
 0.4 dB."""
-_DARK = 0.5 / 255
-"""Pixels below it in both renders show nothing, and are not compared."""
+_DIFFERENT = 0.5 / 255
+"""Pixels nearer to the background in both renders show nothing, and are not compared."""
 
 
 class RenderLoss(NamedTuple):
@@ -64,6 +65,7 @@ def measure_loss(
     frame: TrainingFrame,
     device: torch.device | None = None,
     progress: Progress = silent,
+    background: Color = BLACK,
 ) -> RenderLoss:
     """Render all stages from all views, and compare.
 
@@ -73,8 +75,9 @@ def measure_loss(
         frame: To render in.
         device: Where to render, by default on the CPU.
         progress: Called with the name of a stage and its fraction done.
+        background: Behind all Gaussians.
     """
-    renderers = [ModelRenderer(stage, frame, device) for stage in stages]
+    renderers = [ModelRenderer(stage, frame, device, background) for stage in stages]
     scores: list[list[float]] = []
     likeness: list[list[float]] = []
     for i, view in enumerate(views):
@@ -85,7 +88,9 @@ def measure_loss(
             scores.append([psnr(image, photograph, mask) for image in images])
         found = []
         for before, after in pairwise(images):
-            shown = (torch.maximum(before, after) >= _DARK).any(dim=-1)
+            empty = before.new_tensor(background) / 255
+            differs = torch.maximum((before - empty).abs(), (after - empty).abs())
+            shown = (differs >= _DIFFERENT).any(dim=-1)
             value = psnr(after, before, shown if mask is None else shown & mask)
             found.append(math.inf if math.isnan(value) else value)
         likeness.append(found)

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from splatseed.photos.view import View
 from splatseed.rendering import rasterization
+from splatseed.scene import BLACK, Color
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.training_frame import TrainingFrame
 
@@ -94,6 +95,7 @@ def _rasterize(
     mode: Literal["RGB", "ED"] = "RGB",
     *,
     antialiased: bool = False,
+    background: Float[Tensor, "1 3"] | None = None,
 ) -> tuple[Float[Tensor, "H W D"], Float[Tensor, "H W 1"], dict[str, Any]]:
     """Render features, or harmonics up to a degree; return image, alphas and ``info``."""
     colors: Tensor | tuple[Tensor, Tensor]
@@ -108,6 +110,7 @@ def _rasterize(
         opacity_from_logits(params["opacities"]), colors, camera.viewmats, camera.Ks,
         view.width, view.height, near_plane=view.near, sh_degree=degree, packed=False,
         render_mode=mode, rasterize_mode="antialiased" if antialiased else "classic",
+        backgrounds=background,
     )  # fmt: skip
     # Unlike indexing, squeeze's backward allocates no image of zeros.
     return images.squeeze(0), alphas.squeeze(0), info
@@ -117,19 +120,26 @@ class ModelRenderer:
     """Renders Gaussians in world coordinates without gradients, by default on the CPU.
 
     ``frame`` provides the near plane, and coordinates that suit single precision. Antialiasing
-    follows ``Gaussians.antialiased``.
+    follows ``Gaussians.antialiased``. ``background`` is behind all Gaussians.
     """
 
     def __init__(
-        self, gaussians: Gaussians, frame: TrainingFrame, device: torch.device | None = None
+        self,
+        gaussians: Gaussians,
+        frame: TrainingFrame,
+        device: torch.device | None = None,
+        background: Color = BLACK,
     ) -> None:
         self.frame, self.count = frame, len(gaussians)
         self._antialiased = gaussians.antialiased
         arrays = frame.gaussians_from_world(gaussians).arrays()
         self._params = {name: torch.tensor(array, device=device) for name, array in arrays.items()}
+        self._behind = None
+        if any(background):
+            self._behind = torch.tensor([background], dtype=torch.float32, device=device) / 255
 
     def image(self, view: View) -> Float[Tensor, "H W 3"]:
-        """Render a view: about 0 to 1, the background black."""
+        """Render a view: about 0 to 1, black or ``background`` behind."""
         return self._images(view, "RGB")[0]
 
     def color(self, view: View) -> Float32[np.ndarray, "H W 3"]:
@@ -146,5 +156,6 @@ class ModelRenderer:
     def _images(self, view: View, mode: Literal["RGB", "ED"]) -> tuple[Tensor, Tensor]:
         degree = math.isqrt(1 + self._params["shN"].shape[1]) - 1
         return _rasterize(
-            self._params, self.frame.view(view), degree, mode, antialiased=self._antialiased
-        )[:2]
+            self._params, self.frame.view(view), degree, mode, antialiased=self._antialiased,
+            background=self._behind if mode == "RGB" else None,
+        )[:2]  # fmt: skip

@@ -1,7 +1,9 @@
-"""Read and write PlayCanvas's SOG, version 2: a .zip of lossless WebP images and ``meta.json``.
+"""Read and write PlayCanvas's SOG: a .zip of lossless WebP images and ``meta.json``.
 
 Images have one pixel per Gaussian. A *codebook* maps bytes to 256 numbers, a *palette* maps labels
-to vectors of harmonics. Equal Gaussians give equal bytes. Source: PlayCanvas's specification.
+to vectors of harmonics. Equal Gaussians give equal bytes. Version 2 is written; version 1, without
+a number, is read: in place of codebooks its bytes are steps between bounds, and opacities are
+logits. Source: PlayCanvas's specification, and splat-transform for version 1.
 """
 
 from __future__ import annotations
@@ -9,9 +11,9 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
@@ -27,6 +29,7 @@ from splatseed.splat.packing import (
     PACKING,
     Fit,
     best_fit,
+    clipped_findings,
     from_smallest_three,
     left_out_finding,
     morton_order,
@@ -41,7 +44,8 @@ CONVERTER = "npx @playcanvas/splat-transform"
 """The converter by the authors of SOG and compressed PLY."""
 
 _VERSION = 2
-_META = "meta.json"
+META = "meta.json"
+"""The description of a model, in an archive or a folder."""
 _ANTIALIASED = "antialiased"
 """Value of ``model`` in meta.json for antialiased rendering."""
 _PER_ROW = 64  # palette entries per row of the centroid image
@@ -63,6 +67,8 @@ def encode(
 ) -> list[bytes]:
     """Encode Gaussians in Z-curve order."""
     gaussians = _within_steps(gaussians, note)
+    for finding in clipped_findings(".sog", gaussians, sizes=(-MAX_LOG_SCALE, MAX_LOG_SCALE)):
+        note(finding)
     order = morton_order(gaussians.means)
     curved = _curved(gaussians.means[order])
     low, high = curved.min(axis=0), curved.max(axis=0)
@@ -114,7 +120,7 @@ def encode(
         }
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        archive.writestr(zipfile.ZipInfo(_META, _STAMP), json.dumps(meta))
+        archive.writestr(zipfile.ZipInfo(META, _STAMP), json.dumps(meta))
         for name, pixels in images.items():
             webp = io.BytesIO()
             # `exact` keeps colours where alpha is 0, as opacities and quaternions require.
@@ -153,53 +159,92 @@ def _within_steps(gaussians: Gaussians, note: Note) -> Gaussians:
     return gaussians if kept.all() else gaussians.select(kept)
 
 
-def decode(path: Path, _: Note = silent_note) -> Gaussians:
+def decode(path: Path, note: Note = silent_note) -> Gaussians:
     """Decode a .sog file, or the unpacked folder of a ``meta.json``."""
     with translate_errors(path, "a complete SOG"):
-        content = _part_reader(path)
-        meta = json.loads(content(_META))
-        if "means" not in meta:  # of every version; a run's metrics.json has none
-            raise ValueError("JSON without Gaussians")
-        if meta.get("version") != _VERSION:
-            raise SceneFormatError(
-                f"{path} to be a SOG of version {_VERSION}",
-                found=f"version {meta.get('version', 1)}",
-                fix=f"Convert it: {CONVERTER} IN OUT.sog.",
-            )
-        count = int(meta["count"])
-        if count < 1:
-            raise ValueError(f"{count} Gaussians")
-
-        def pixels(part: str, file_idx: int = 0, num: int = count) -> UInt8[np.ndarray, "P 4"]:
-            name = meta[part]["files"][file_idx]
-            with Image.open(io.BytesIO(content(name))) as picture:
-                rows = np.asarray(picture.convert("RGBA")).reshape(-1, 4)
-            if len(rows) < num:
-                raise ValueError(f"{len(rows):,} pixels in {name}, of {num:,}")
-            return rows[:num]
-
-        low, high = (pixels("means", i)[:, :3].astype(np.uint16) for i in (0, 1))
-        lower, upper = (np.array(meta["means"][end], np.float64) for end in ("mins", "maxs"))
+        parts = _Parts.of(path)
+        low, high = (parts.pixels("means", i)[:, :3].astype(np.uint16) for i in (0, 1))
+        lower, upper = (np.array(parts.meta["means"][end], np.float64) for end in ("mins", "maxs"))
         curved = lower + (low | high << 8) / 65535 * (upper - lower)
-        quats, sh0 = pixels("quats"), pixels("sh0")
+        quats, sh0 = parts.pixels("quats"), parts.pixels("sh0")
         largest = np.clip(quats[:, 3].astype(np.int64) - _QUAT_ALPHA, 0, 3)
         three = (quats[:, :3] / 255 - 0.5) * np.sqrt(2)
-        centers = {part: np.array(meta[part]["codebook"], np.float32) for part in ("scales", "sh0")}
-        shN = np.zeros((count, 0, 3), np.float32)
-        if "shN" in meta:
-            rest, entries = SH_COUNTS[int(meta["shN"]["bands"])], int(meta["shN"]["count"])
-            book = np.array(meta["shN"]["codebook"], np.float32)
-            table = book[pixels("shN", 0, entries * rest)[:, :3].reshape(entries, rest, 3)]
-            shN = table[pixels("shN", 1)[:, :2].astype(np.int64) @ np.array([1, 256])]
+        if parts.first:
+            colors, opacities = np.split(parts.numbers("sh0", sh0), [3], axis=1)
+        else:
+            colors, opacities = parts.numbers("sh0", sh0[:, :3]), opacity_logits(sh0[:, 3])
+        model = parts.meta.get("model", "default")
+        if model not in {"default", _ANTIALIASED}:
+            text = f"{path} is a model of kind {model}, read as Gaussians: renders may differ."
+            note(Finding("other-renderer", text, subjects=(str(path),)))
         return Gaussians(
             means=np.asarray(np.sign(curved) * np.expm1(np.abs(curved)), np.float32),
-            scales=centers["scales"][pixels("scales")[:, :3]],
+            scales=parts.numbers("scales", parts.pixels("scales")[:, :3]),
             quats=from_smallest_three(largest, three.astype(np.float32)),
-            opacities=opacity_logits(sh0[:, 3]),
-            sh0=centers["sh0"][sh0[:, None, :3]],
-            shN=shN,
-            antialiased=meta.get("model") == _ANTIALIASED,
+            opacities=opacities.reshape(parts.count),
+            sh0=colors[:, None],
+            shN=parts.harmonics(),
+            antialiased=model == _ANTIALIASED,
         )
+
+
+class _Parts(NamedTuple):
+    """The parts of a file, which its description names."""
+
+    content: Callable[[str], bytes]
+    meta: Mapping[str, Any]
+    count: int
+    first: bool  # version 1: bytes are steps between bounds, not indices of codebooks
+
+    @classmethod
+    def of(cls, path: Path) -> Self:
+        content = _part_reader(path)
+        meta = json.loads(content(META))
+        if "means" not in meta:  # of every version; a run's metrics.json has none
+            raise ValueError("JSON without Gaussians")
+        version = meta.get("version", 1)
+        if version not in {1, _VERSION}:
+            raise SceneFormatError(
+                f"{path} to be a SOG of version 1 or {_VERSION}",
+                found=f"version {version}",
+                fix="Export a .ply with the program that wrote it.",
+            )
+        count = int(meta["means"]["shape"][0] if version == 1 else meta["count"])
+        if count < 1:
+            raise ValueError(f"{count} Gaussians")
+        return cls(content, meta, count, version == 1)
+
+    def image(self, part: str, file_idx: int = 0) -> UInt8[np.ndarray, "H W 4"]:
+        with Image.open(io.BytesIO(self.content(self.meta[part]["files"][file_idx]))) as picture:
+            return np.asarray(picture.convert("RGBA"))
+
+    def pixels(
+        self, part: str, file_idx: int = 0, num: int | None = None
+    ) -> UInt8[np.ndarray, "P 4"]:
+        rows, num = self.image(part, file_idx).reshape(-1, 4), self.count if num is None else num
+        if len(rows) < num:
+            raise ValueError(f"{len(rows):,} pixels in an image of {part}, of {num:,}")
+        return rows[:num]
+
+    def numbers(self, part: str, codes: UInt8[np.ndarray, "P C"]) -> Float32[np.ndarray, "P C"]:
+        if not self.first:
+            return np.array(self.meta[part]["codebook"], np.float32)[codes]
+        low, high = (np.array(self.meta[part][end], np.float64) for end in ("mins", "maxs"))
+        return np.asarray(low + codes / 255 * (high - low), np.float32)
+
+    def harmonics(self) -> Float32[np.ndarray, "N K 3"]:
+        if "shN" not in self.meta:
+            return np.zeros((self.count, 0, 3), np.float32)
+        labels = self.pixels("shN", 1)[:, :2].astype(np.int64) @ np.array([1, 256])
+        if self.first:
+            rest, entries = self.image("shN").shape[1] // _PER_ROW, int(labels.max()) + 1
+        else:
+            rest = SH_COUNTS[int(self.meta["shN"]["bands"])]
+            entries = int(self.meta["shN"]["count"])
+        if rest not in SH_COUNTS:
+            raise ValueError(f"harmonics of {rest} coefficients")
+        table = self.numbers("shN", self.pixels("shN", 0, entries * rest)[:, :3])
+        return table.reshape(entries, rest, 3)[labels]
 
 
 def _grid(values: np.ndarray) -> UInt8[np.ndarray, "H W 4"]:
@@ -214,11 +259,13 @@ def _grid(values: np.ndarray) -> UInt8[np.ndarray, "H W 4"]:
 
 def _part_reader(path: Path) -> Callable[[str], bytes]:
     if path.name.lower().endswith(".json"):
-        return lambda name: read_bytes(path if name == _META else path.parent / Path(name).name)
+        return lambda name: read_bytes(path if name == META else path.parent / Path(name).name)
     archive = zipfile.ZipFile(io.BytesIO(read_bytes(path)))
+    folder = next((n for n in archive.namelist() if n.endswith(f"/{META}")), "").removesuffix(META)
 
     def content(name: str) -> bytes:
-        if archive.getinfo(name).file_size > (_MAX_META if name == _META else _MAX_BYTES):
+        name = folder + name
+        if archive.getinfo(name).file_size > (_MAX_META if name.endswith(META) else _MAX_BYTES):
             raise ValueError(f"{name} of {archive.getinfo(name).file_size:,} bytes")
         return archive.read(name)
 

@@ -9,19 +9,34 @@ from pathlib import Path
 
 import numpy as np
 
+from splatseed.findings import Finding
 from splatseed.io.files import ByteReader
 from splatseed.progress import Note, silent_note
 from splatseed.splat.gaussians import SH_C0, Gaussians, antialiasing_finding
-from splatseed.splat.packing import opacity_bytes, opacity_logits, rounded_bytes, unit_quats
+from splatseed.splat.packing import (
+    clipped_findings,
+    opacity_bytes,
+    opacity_logits,
+    rounded_bytes,
+    unit_quats,
+)
 
 RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 """One Gaussian: scales are standard deviations, the rotation is 128 q + 128."""
+
+_FIRST = (-0.5 / SH_C0, 0.5 / SH_C0)
+"""First coefficients of colours from 0 to 1."""
 
 
 def encode(gaussians: Gaussians, note: Note = silent_note) -> list[bytes]:
     """Encode Gaussians, sorted by size times opacity so that viewers can draw the largest first."""
     if gaussians.antialiased:
         note(antialiasing_finding("a .splat"))
+    if gaussians.shN.size:
+        text = "A .splat has no view-dependent colour: the model's is left out."
+        note(Finding("unused-harmonics", text))
+    for finding in clipped_findings(".splat", gaussians, first=_FIRST):
+        note(finding)
     log_opacity = -np.logaddexp(0, -gaussians.opacities.astype(np.float64))
     size = gaussians.scales.astype(np.float64).sum(axis=1) + log_opacity
     order = np.argsort(-size, kind="stable")

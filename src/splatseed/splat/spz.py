@@ -29,6 +29,7 @@ from splatseed.splat.packing import (
     PACKING,
     Fit,
     best_fit,
+    clipped_findings,
     from_smallest_three,
     left_out_finding,
     morton_order,
@@ -37,7 +38,6 @@ from splatseed.splat.packing import (
     rounded_bytes,
     smallest_three,
 )
-from splatseed.text import agreeing, counted
 
 MAGIC = b"NGSP"
 _HEADER = struct.Struct("<4sIIBBBB")
@@ -62,7 +62,7 @@ _COLOR = 0.15 * 255
 """Bytes per unit of the first coefficient: the format's scale."""
 
 
-class _Signs(NamedTuple):
+class AxisSigns(NamedTuple):
     """Signs that turn a model's axes into ours: of positions, of wxyz, and of harmonics."""
 
     position: Float32[np.ndarray, " 3"]
@@ -70,15 +70,18 @@ class _Signs(NamedTuple):
     sh: Float32[np.ndarray, " 15"]  # of degrees 1 to 3
 
 
-def _signs(axes: int) -> _Signs:
+def axis_signs(axes: int) -> AxisSigns:
+    """Return the signs that turn axes, by their number in the extension, into ours."""
     right, up, front = (bool((axes - 1) >> bit & 1) for bit in range(3))
     x, y, z = 1 if right else -1, -1 if up else 1, 1 if front else -1
     sh = [y, z, x, x * y, y * z, 1, x * z, 1, y, x * y * z, y, z, x, z, x]
     rows = [x, y, z], [1, y * z, x * z, x * y], sh
-    return _Signs(*(np.array(row, np.float32) for row in rows))
+    return AxisSigns(*(np.array(row, np.float32) for row in rows))
 
 
-_OWN = _signs(_RIGHT_UP_BACK)
+_OWN = axis_signs(_RIGHT_UP_BACK)
+_FIRST, _FURTHER = (-127.5 / _COLOR, 127.5 / _COLOR), (-1.0, 127 / 128)
+"""First and further coefficients that bytes hold."""
 _STEP = 4
 """Harmonics are rounded to multiples of this many 128ths, which compress better. Niantic's writer
 uses 8 for degree 1 and 16 beyond it: files are a quarter smaller, but the small coefficients of a
@@ -145,20 +148,12 @@ def _fixed_point(gaussians: Gaussians, note: Note) -> tuple[Gaussians, int]:
                 "format, or move the model to the origin.",
             )
         )
-    scales = np.sort(
-        gaussians.scales[kept], axis=1
-    )  # the thickness of a flat Gaussian does not matter
-    beyond = (scales[:, 2] > _LOG_SCALES[1]) | (scales[:, 1] < _LOG_SCALES[0])
-    if number := int(np.count_nonzero(beyond)):
-        smallest, largest = np.exp(_LOG_SCALES)
-        note(
-            Finding(
-                "clipped-sizes",
-                f"A .spz holds sizes from {smallest:.2g} to {largest:.0f} units: "
-                f"{counted(number, 'Gaussian')} {agreeing(number, 'was', 'were')} clipped.",
-            )
-        )
-    return gaussians if kept.all() else gaussians.select(kept), bits
+    kept_ones = gaussians if kept.all() else gaussians.select(kept)
+    for finding in clipped_findings(
+        ".spz", kept_ones, sizes=_LOG_SCALES, first=_FIRST, further=_FURTHER
+    ):
+        note(finding)
+    return kept_ones, bits
 
 
 def decode(path: Path, note: Note = silent_note) -> Gaussians:
@@ -186,7 +181,7 @@ def decode(path: Path, note: Note = silent_note) -> Gaussians:
             extensions = stream.decompress(stream.unconsumed_tail, _MAX_EXTENSIONS)
         if len(body) != num_bytes or not (in_zstd or stream.eof):
             raise ValueError(f"a stream that ends after {len(body):,} of {num_bytes:,} bytes")
-        signs = _signs(_axes_in(path, extensions) if flags & _EXTENDED else _RIGHT_UP_BACK)
+        signs = axis_signs(_axes_in(path, extensions) if flags & _EXTENDED else _RIGHT_UP_BACK)
         parts = np.split(np.frombuffer(body, np.uint8), count * np.cumsum(sizes)[:-1])
         position, opacity, color, scale, rotation, sh = (part.reshape(count, -1) for part in parts)
         harmonics = (sh.reshape(count, rest, 3).astype(np.float32) - 128) / 128

@@ -94,6 +94,7 @@ class Evaluation:
             masks=self.request.masks,
             trained_on=self.config.get("photographs"),
             near_plane=near_plane_of(self.config),
+            background=self.request.background or ("black" if self.config else None),
             device=pick_device(self.request.backend, progress),
             cache_dir=user_cache_dir(),
             progress=progress,

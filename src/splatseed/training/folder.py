@@ -24,7 +24,7 @@ from splatseed.io.masks import NONE
 from splatseed.io.origin import add_offset
 from splatseed.io.staging import MANIFEST, atomic_file, write_json
 from splatseed.scene import Scene
-from splatseed.splat.formats import RUN_FILE
+from splatseed.splat.formats import RUN_FILE, unpacked_model
 from splatseed.text import quoted
 
 KIND = "train"  # in a run folder's manifest
@@ -137,8 +137,8 @@ def model_file(path: Path) -> Path:
         SceneNotFoundError: There is none, or the run has not finished.
     """
     folder = RunFolder(path)
-    for file in (path, folder.gaussians):
-        if file.is_file():
+    for file in (path, folder.gaussians, unpacked_model(path)):
+        if file is not None and file.is_file():
             return file
     found, fix = special_kind(path) or "nothing there", "Check the path."
     if folder.is_run:

@@ -25,8 +25,9 @@ from splatseed.photos.sizes import default_factor
 from splatseed.photos.view import View, camera_views
 from splatseed.progress import Progress, silent
 from splatseed.sampling import evenly_spaced
-from splatseed.scene import Image, Scene
+from splatseed.scene import BLACK, Color, Image, Scene
 from splatseed.similarity import Similarity
+from splatseed.splat.background import background_of
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.model_frame import scene_from_model, translate_gaussians, view_in_model_frame
 from splatseed.splat.training_frame import TrainingFrame, frame_of_model
@@ -47,6 +48,8 @@ class ModelViews(NamedTuple):
     """Some of the test views; with their photographs, if the scene has them."""
     frame: TrainingFrame
     """To render in."""
+    background: Color = BLACK
+    """Behind renders, and behind transparent pixels of the photographs."""
 
 
 def find_model_views(
@@ -73,6 +76,7 @@ def find_model_views(
     """
     masks = config.get("masks")
     scene = with_masks(load_scene(scene_path, require_points=False), masks)
+    scene = scene.replace(background=background_of(path) or BLACK)
     photographed = False
     with suppress(SceneNotFoundError):
         scene, photographed = with_photographs(scene), True
@@ -106,6 +110,7 @@ def find_model_views(
         views,
         views_of(compared, pixels=True),
         frame_of_model(views, points if world is None else world.points(points), gaussians),
+        scene.background,
     )
 
 

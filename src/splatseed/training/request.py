@@ -97,16 +97,22 @@ class EvaluateRequest:
     leaves at most 1600 pixels on the longer side."""
     test_every: int | None = None
     """Score every n-th image, sorted by name; by default as the run was trained, else 8."""
-    transform: Annotated[str | None, tyro.conf.arg(metavar="FILE|gsplat|flipped|none")] = None
+    transform: Annotated[str | None, tyro.conf.arg(metavar="FILE|gsplat|flipped|turned|none")] = (
+        None
+    )
     """From the scene's world to the model's, if its trainer normalised the scene: a JSON file with
     a matrix, nerfstudio's dataparser_transforms.json, graphdeco's cameras.json, gsplat for its
-    examples' normalisation, or flipped for y and z negated; none: score the model where it is,
-    unchanged."""
+    examples' normalisation, flipped for y and z negated, or turned for x and y; none: score the
+    model where it is, unchanged."""
     masks: MaskChoice = None
     """A folder of masks, where pixels of 0 do not count, or none; inverted: only they count. By
     default the run's, else the folder masks beside the photographs. Transparent pixels are empty
     space around an object that is cut out, and do not count elsewhere; none: always empty, alpha:
     never."""
+    background: Annotated[str | None, tyro.conf.arg(metavar="black|white|R,G,B")] = None
+    """The background of renders, over which transparent pixels of photographs are composited, too;
+    by default what the trainer recorded beside the model (graphdeco's cfg_args, nerfstudio's
+    config.yml), else black."""
     lpips_weights: Path | None = None
     """The file of VGG's weights for LPIPS, or its folder; by default PyTorch's cache."""
     backend: Backend = "auto"

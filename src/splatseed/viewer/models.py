@@ -25,9 +25,10 @@ from splatseed.photos.camera_check import reference_points
 from splatseed.photos.upright import quarter_turns, turned
 from splatseed.photos.view import View, camera_views, view_of
 from splatseed.progress import Note, silent_note
-from splatseed.scene import Scene
+from splatseed.scene import BLACK, Color, Scene
 from splatseed.similarity import Similarity
-from splatseed.splat.formats import holds_gaussians, read_gaussians
+from splatseed.splat.background import background_of
+from splatseed.splat.formats import holds_gaussians, read_gaussians, unpacked_model
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.model_frame import move_to_scene_origin, scene_from_model, transform_gaussians
 from splatseed.splat.training_frame import TrainingFrame, frame_of_model
@@ -53,6 +54,7 @@ class ViewerItem:
         test_every: Every n-th image by name is a test view.
         findings: What was changed in the model on reading.
         moved: How the model was moved from its trainer's frame; None if it was in the scene's.
+        background: Of its renders, over which transparent pixels of photographs are composited.
     """
 
     name: str
@@ -62,6 +64,7 @@ class ViewerItem:
     test_every: int = 8
     findings: tuple[Finding, ...] = ()
     moved: Similarity | None = None
+    background: Color = BLACK
 
     @property
     def model(self) -> Gaussians:
@@ -97,12 +100,17 @@ def open_item(path: StrPath, scene_path: Path | None = None) -> ViewerItem:
 
     folder, findings = RunFolder(path), list[Finding]()
     if not path.is_dir() or not folder.is_run:
+        path = unpacked_model(path) or path
         if path.is_file() and holds_gaussians(path):
             gaussians, scene = read_gaussians(path, findings.append), scene_at(scene_path)
-            moved = None
+            moved, background = None, background_of(path, note=findings.append) or BLACK
             if scene is not None:
+                scene = scene.replace(background=background)
                 gaussians, moved = _in_scene(path, scene, gaussians, findings.append)
-            return ViewerItem(path.name, scene, gaussians, findings=tuple(findings), moved=moved)
+            return ViewerItem(
+                path.name, scene, gaussians,
+                findings=tuple(findings), moved=moved, background=background,
+            )  # fmt: skip
         scene = load_scene(path, require_points=False)
         if not scene.images and not len(scene.points):
             raise SceneFormatError(

@@ -144,7 +144,7 @@ class Entry:
     @cached_property
     def renderer(self) -> ModelRenderer:
         """Renderer of all Gaussians."""
-        return ModelRenderer(self.item.model, self.frame, self._device)
+        return self._renderer_of(self.item.model)
 
     @cached_property
     def fast_renderer(self) -> ModelRenderer:
@@ -152,7 +152,10 @@ class Entry:
         gaussians, on_gpu = self.item.gaussians, getattr(self._device, "type", "cpu") == "cuda"
         if gaussians is None or on_gpu or len(gaussians) <= MAX_MOVING:
             return self.renderer
-        return ModelRenderer(_most_visible(gaussians, MAX_MOVING), self.frame, self._device)
+        return self._renderer_of(_most_visible(gaussians, MAX_MOVING))
+
+    def _renderer_of(self, gaussians: Gaussians) -> ModelRenderer:
+        return ModelRenderer(gaussians, self.frame, self._device, self.item.background)
 
     @property
     def has_model(self) -> bool:

@@ -160,7 +160,7 @@ class GlbCloud(CloudFile):
 
 
 def _primitives(path: Path, content: Mapping[str, Any], body: int) -> Iterator[_Part]:
-    for mesh, matrix in _placed(content):
+    for mesh, matrix in placed_meshes(content):
         for primitive in content["meshes"][mesh]["primitives"]:
             if "KHR_draco_mesh_compression" in primitive.get("extensions", {}):
                 raise ValueError("vertices compressed by Draco")
@@ -175,7 +175,7 @@ def _primitives(path: Path, content: Mapping[str, Any], body: int) -> Iterator[_
             yield _Part(mode, matrix, tables["POSITION"], color)
 
 
-def _placed(content: Mapping[str, Any]) -> Iterator[tuple[int, Float64[np.ndarray, "4 4"]]]:
+def placed_meshes(content: Mapping[str, Any]) -> Iterator[tuple[int, Float64[np.ndarray, "4 4"]]]:
     """Yield meshes with the transform from their frame to the scene's."""
     nodes, scenes = content.get("nodes", []), content.get("scenes")
     children = {child for node in nodes for child in node.get("children", [])}
