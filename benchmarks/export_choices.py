@@ -6,7 +6,7 @@ python -m benchmarks.export_choices RUN ...
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -25,7 +25,7 @@ from splatseed.splat.render_loss import measure_loss
 from splatseed.splat.rendering import ModelRenderer
 from splatseed.splat.selection import isolated, largest, visible_area
 from splatseed.training import model_views
-from splatseed.training.decimation import most_needed, needs
+from splatseed.training.decimation import fit_sizes, most_needed, needs
 from splatseed.training.folder import config_of, model_file
 from splatseed.training.parameters import make_parameters
 from splatseed.training.strategies.grow import contributions
@@ -100,9 +100,9 @@ def _thinned(
         keeps = {"need, in rounds": most_needed(gaussians, views, count, CPU)}
         keeps |= {name: largest(each, count) for name, each in rules.items()}
         models = [gaussians.select(keep) for keep in keeps.values()]
-        wider = replace(models[0], scales=models[0].scales + np.float32(0.05))
-        names = [*keeps, "need, in rounds, sizes + 5%"]
-        for name, score in zip(names, _scores([*models, wider], views), strict=True):
+        models.append(fit_sizes(models[0], gaussians, views, CPU)[0])
+        names = [*keeps, "need, in rounds, sizes fitted: in use"]
+        for name, score in zip(names, _scores(models, views), strict=True):
             cells.setdefault(name, []).append(f"{score:.2f}")
     return cells
 

@@ -109,7 +109,7 @@ def lpips_scores(lpips: Lpips) -> dict[str, Score]:
 
     return {
         "ours, LichtFeld Studio: VGG, -1 to 1": lambda x, y: lpips(x.clamp(0, 1), y),
-        "graphdeco, gsplat with `--lpips_net vgg`: VGG, 0 to 1": unscaled,
+        "graphdeco, gsplat with lpips_net vgg: VGG, 0 to 1": unscaled,
     }
 
 

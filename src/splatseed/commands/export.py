@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
-from jaxtyping import Bool
 
 from splatseed.commands.options import check_free, parse_options, refuse
 from splatseed.console import print_note, print_pairs, stage_display
@@ -113,8 +112,7 @@ def run(arguments: list[str]) -> None:
         gaussians = read_gaussians(job.path, findings.append)
         cropped = filter_gaussians(gaussians, job.crop)
         views = _views(job, gaussians, clock, findings.append)
-        keep, rows = _kept(job, gaussians, views, clock)
-        kept = gaussians.select(keep)
+        kept, rows = _kept(job, gaussians, views, clock)
         stages = {"model": cropped}
         if len(kept) < len(cropped):
             stages["kept"] = kept
@@ -203,7 +201,7 @@ def _views(job: _Job, gaussians: Gaussians, progress: Progress, note: Note) -> M
 
 def _kept(
     job: _Job, gaussians: Gaussians, views: ModelViews | None, progress: Progress
-) -> tuple[Bool[np.ndarray, " N"], list[tuple[str, str]]]:
+) -> tuple[Gaussians, list[tuple[str, str]]]:
     """Choose the Gaussians to write; also return rows that tell what was left out."""
     options, rows = job.options, list[tuple[str, str]]()
     # What leaves nothing is refused before photographs are compared.
@@ -231,24 +229,28 @@ def _kept(
             "Gaussians that are left", found=f"none of {len(gaussians):,}",
             fix="Leave one of `crop`, `min_opacity`, `clean` and `drop_isolated` out.",
         )  # fmt: skip
-    if job.budget is not None and job.budget < np.count_nonzero(keep):
-        keep[keep], how = _within_budget(job.budget, gaussians.select(keep), views, progress)
+    kept = gaussians if keep.all() else gaussians.select(keep)
+    if job.budget is not None and job.budget < len(kept):
+        kept, how = _within_budget(job.budget, kept, views, progress)
         rows.append(("budget", f"{job.budget:,}, {how}"))
-    return keep, rows
+    return kept, rows
 
 
 def _within_budget(
     budget: int, gaussians: Gaussians, views: ModelViews | None, progress: Progress
-) -> tuple[Bool[np.ndarray, " N"], str]:
-    """Choose the Gaussians of a budget; also return how, in words."""
+) -> tuple[Gaussians, str]:
+    """Thin Gaussians to a budget; also return how, in words."""
     if views is None:
-        keep = largest(visible_area(gaussians), budget)
-        return keep, "by opacity and area; name the --scene for a better choice"
-    from splatseed.training.decimation import most_needed
+        kept = gaussians.select(largest(visible_area(gaussians), budget))
+        return kept, "by opacity and area; name the --scene for a better choice"
+    from splatseed.training.decimation import fit_sizes, most_needed
     from splatseed.training.floaters import render_device
 
-    keep = most_needed(gaussians, views, budget, render_device(progress), progress)
-    return keep, f"by what changes in {counted(len(views.train), 'training view')}"
+    device = render_device(progress)
+    kept = gaussians.select(most_needed(gaussians, views, budget, device, progress))
+    kept, share = fit_sizes(kept, gaussians, views, device, progress)
+    how = f"by what changes in {counted(len(views.train), 'training view')}"
+    return kept, how + (f"; sizes + {share:.0%}" if share else "")
 
 
 def _write_file(job: _Job, kept: Gaussians, progress: Progress, note: Note) -> Similarity:

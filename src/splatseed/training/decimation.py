@@ -14,6 +14,7 @@ One gradient gives all needs of a view: with random signs z_pc, the expectation 
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -23,9 +24,10 @@ from jaxtyping import Bool, Float32
 
 from splatseed.photos.view import View
 from splatseed.progress import Progress, silent
+from splatseed.sampling import evenly_spaced
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.photographs import mask_tensor
-from splatseed.splat.rendering import opacity_from_logits, render_view
+from splatseed.splat.rendering import ModelRenderer, opacity_from_logits, render_view
 from splatseed.splat.selection import largest
 from splatseed.training.model_views import ModelViews
 from splatseed.training.parameters import make_parameters
@@ -35,6 +37,10 @@ MAX_MEASURED_LOGIT = 6.0
 gradient."""
 MIN_SHARE = 0.7
 """Of the Gaussians, the smallest share that a round keeps."""
+SHARES = (0.0, 0.02, 0.04, 0.06, 0.08, 0.1, 0.13, 0.16, 0.2)
+"""By which Gaussians are widened, at most."""
+MAX_FITTED = 8
+"""Training views in which sizes are fitted."""
 
 
 def most_needed(
@@ -67,6 +73,36 @@ def most_needed(
     keep = np.zeros(len(framed), bool)
     keep[kept] = True
     return keep
+
+
+@torch.no_grad()
+def fit_sizes(
+    kept: Gaussians,
+    whole: Gaussians,
+    views: ModelViews,
+    device: torch.device,
+    progress: Progress = silent,
+) -> tuple[Gaussians, float]:
+    """Widen the Gaussians that are kept to close the gaps between them; return by what share, too.
+
+    The share is that of ``SHARES`` whose renders come closest to those of the whole model, in some
+    of the training views.
+    """
+    seen = [views.train[i] for i in evenly_spaced(len(views.train), MAX_FITTED)]
+    renderer = ModelRenderer(whole, views.frame, device, views.background)
+    targets = [renderer.image(view) for view in seen]
+    best, share, least = kept, 0.0, math.inf
+    for i, wider in enumerate(SHARES):
+        model = dataclasses.replace(kept, scales=kept.scales + np.float32(math.log1p(wider)))
+        renderer = ModelRenderer(model, views.frame, device, views.background)
+        pairs = zip(seen, targets, strict=True)
+        error = sum(float((renderer.image(view) - each).square().sum()) for view, each in pairs)
+        progress("fit sizes", (i + 1) / len(SHARES))
+        if error >= least:
+            break
+        best, share, least = model, wider, error
+    progress("fit sizes", 1.0)
+    return best, share
 
 
 def num_rounds(count: int, budget: int) -> int:
