@@ -180,22 +180,25 @@ def test_a_transform_that_would_be_refused_is_not_suggested(room, gaussians, tmp
             check_frame(tmp_path / "model.ply", scene, small, given)
 
 
-def test_a_flipped_model_is_named_and_a_cropped_one_is_accepted(room, gaussians, psnr, tmp_path):
+@pytest.mark.parametrize("name", ["flipped", "turned"])
+def test_a_flipped_model_is_named_and_a_cropped_one_is_accepted(
+    name, room, gaussians, psnr, tmp_path
+):
     """As of a .spz without converted axes, and of a model that its user cropped to a subject."""
     path, scene = tmp_path / "model.ply", load_scene(room)
-    write_gaussians(path, transform_gaussians(gaussians, find_transform("flipped", scene)))
-    with pytest.raises(SceneFormatError, match=r"transform=.flipped"):
+    write_gaussians(path, transform_gaussians(gaussians, find_transform(name, scene)))
+    with pytest.raises(SceneFormatError, match=rf"transform=.{name}"):
         load_model(path, room)
-    scored = evaluate_model(load_model(path, room, transform="flipped"))
+    scored = evaluate_model(load_model(path, room, transform=name))
     assert scored.psnr == pytest.approx(psnr, abs=0.05)
     distance = np.linalg.norm(gaussians.means - gaussians.means[0], axis=1)
     part = gaussians.select(np.argsort(distance)[: len(gaussians) // 4])
     notes = []
     check_frame(path, scene, part, note=notes.append)
     assert not notes
-    turned = transform_gaussians(part, find_transform("flipped", scene))
+    turned = transform_gaussians(part, find_transform(name, scene))
     move_to_scene_frame(path, scene, turned, notes.append)
-    assert "flipped" in str(notes[0])
+    assert name in str(notes[0])
     moved = replace(part, means=part.means + np.float32([0, 0, 30]))
     with pytest.raises(SceneFormatError, match="No known transform fits"):
         check_frame(path, scene, moved)

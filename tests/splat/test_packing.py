@@ -112,3 +112,12 @@ def test_shells_and_z_curve_ignore_outliers():
     line = np.linspace(-1, 1, 50, dtype=np.float32)[:, None] * np.ones(3, np.float32)
     with_far = np.vstack([line, [[1e12, 1e12, 1e12]]]).astype(np.float32)
     assert np.array_equal(morton_order(with_far), np.arange(51))
+
+
+def test_the_z_curve_of_a_wide_flat_model_is_short():
+    """A plane's Z curve steps 1.7 cells in the mean; the height's noise must not cut it up."""
+    x, z = (each.ravel() for each in np.meshgrid(np.arange(64.0), np.arange(64.0)))
+    y = np.random.default_rng(0).normal(0, 0.05, 4096)
+    means = np.column_stack([x, y, z]).astype(np.float32)
+    steps = np.linalg.norm(np.diff(means[morton_order(means)], axis=0), axis=1)
+    assert steps.mean() < 2

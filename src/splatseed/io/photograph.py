@@ -188,7 +188,9 @@ def _colors_of(
         opacity = values[..., -1] / np.float32(opaque_value(values[..., -1]))
         if not composited:
             opacity = (opacity >= OPAQUE / 255).astype(np.float32)
-        shown = shown * opacity[..., None] + (1 - opacity[..., None]) * np.float32(background)
+        shown = shown * opacity[..., None] + (1 - opacity[..., None]) * np.array(
+            background, np.float32
+        )
     transparent = photograph.info.get("transparency")
     if isinstance(transparent, tuple):
         shown[(colors == transparent).all(axis=-1)] = background

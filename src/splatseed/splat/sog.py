@@ -181,7 +181,7 @@ def decode(path: Path, note: Note = silent_note) -> Gaussians:
             means=np.asarray(np.sign(curved) * np.expm1(np.abs(curved)), np.float32),
             scales=parts.numbers("scales", parts.pixels("scales")[:, :3]),
             quats=from_smallest_three(largest, three.astype(np.float32)),
-            opacities=opacities.reshape(parts.count),
+            opacities=opacities.reshape(parts.num),
             sh0=colors[:, None],
             shN=parts.harmonics(),
             antialiased=model == _ANTIALIASED,
@@ -193,7 +193,7 @@ class _Parts(NamedTuple):
 
     content: Callable[[str], bytes]
     meta: Mapping[str, Any]
-    count: int
+    num: int  # Gaussians
     first: bool  # version 1: bytes are steps between bounds, not indices of codebooks
 
     @classmethod
@@ -221,20 +221,20 @@ class _Parts(NamedTuple):
     def pixels(
         self, part: str, file_idx: int = 0, num: int | None = None
     ) -> UInt8[np.ndarray, "P 4"]:
-        rows, num = self.image(part, file_idx).reshape(-1, 4), self.count if num is None else num
+        rows, num = self.image(part, file_idx).reshape(-1, 4), self.num if num is None else num
         if len(rows) < num:
             raise ValueError(f"{len(rows):,} pixels in an image of {part}, of {num:,}")
         return rows[:num]
 
     def numbers(self, part: str, codes: UInt8[np.ndarray, "P C"]) -> Float32[np.ndarray, "P C"]:
         if not self.first:
-            return np.array(self.meta[part]["codebook"], np.float32)[codes]
+            return np.asarray(np.array(self.meta[part]["codebook"], np.float32)[codes])
         low, high = (np.array(self.meta[part][end], np.float64) for end in ("mins", "maxs"))
         return np.asarray(low + codes / 255 * (high - low), np.float32)
 
     def harmonics(self) -> Float32[np.ndarray, "N K 3"]:
         if "shN" not in self.meta:
-            return np.zeros((self.count, 0, 3), np.float32)
+            return np.zeros((self.num, 0, 3), np.float32)
         labels = self.pixels("shN", 1)[:, :2].astype(np.int64) @ np.array([1, 256])
         if self.first:
             rest, entries = self.image("shN").shape[1] // _PER_ROW, int(labels.max()) + 1
@@ -244,7 +244,7 @@ class _Parts(NamedTuple):
         if rest not in SH_COUNTS:
             raise ValueError(f"harmonics of {rest} coefficients")
         table = self.numbers("shN", self.pixels("shN", 0, entries * rest)[:, :3])
-        return table.reshape(entries, rest, 3)[labels]
+        return np.asarray(table.reshape(entries, rest, 3)[labels])
 
 
 def _grid(values: np.ndarray) -> UInt8[np.ndarray, "H W 4"]:

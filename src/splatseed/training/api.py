@@ -209,9 +209,10 @@ def evaluate(
         progress: Called with the name of a stage and its fraction done.
         **options: Fields of ``EvaluateRequest``: ``data_factor`` and ``test_every``, by default as
             the run was trained; ``transform`` from the scene's frame to the model's (a file,
-            "gsplat", "flipped", or "none" to skip the check that they agree); ``masks`` (a folder,
-            "none", "inverted", "alpha"); ``lpips_weights``, a file, without which, here or in
-            PyTorch's cache, LPIPS is None; ``backend``.
+            "gsplat", "flipped", "turned", or "none" to skip the check that they agree); ``masks``
+            (a folder, "none", "inverted", "alpha"); ``background`` ("black", "white" or "R,G,B", by
+            default what the model's trainer recorded, else black); ``lpips_weights``, a file,
+            without which, here or in PyTorch's cache, LPIPS is None; ``backend``.
 
     Returns:
         Means over the test views, as attributes (``psnr`` in dB, ``cc_psnr``, ``covisible_psnr``,
