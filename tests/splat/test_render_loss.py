@@ -76,6 +76,13 @@ def test_stages_are_compared_one_after_another(model, views):
     assert loss.likeness[0] < 30
     assert math.isinf(loss.likeness[1])
     assert loss.finding(".spz") is None
+    # A camera that sees nothing has no part; if none sees anything, that is no likeness.
+    away = views[0].posed(np.diag([1.0, -1, -1, 1]))
+    both = measure_loss([model, half], [views[0], away], FRAME).likeness
+    assert both == measure_loss([model, half], views[:1], FRAME).likeness
+    nothing = measure_loss([model, half], [dataclasses.replace(away, photograph=NO_PIXELS)], FRAME)
+    assert math.isnan(nothing.likeness[0])
+    assert nothing.finding(".spz") is None
 
 
 def test_small_losses_are_not_reported():

@@ -326,7 +326,10 @@ def _loss_rows(
         return [("score", f"{scores}; PSNR, {counted(loss.views, 'test view')}")]
     where = "around it" if views is None else "of its scene"
     alike = ", ".join(
-        f"{name} {x:.1f} dB" for name, x in zip(list(stages)[1:], loss.likeness, strict=True)
+        f"{name} {x:.1f} dB"
+        if np.isfinite(x)
+        else f"{name} {'not seen' if np.isnan(x) else 'equal'}"
+        for name, x in zip(list(stages)[1:], loss.likeness, strict=True)
     )
     return [("likeness", f"{alike}; PSNR of renders, {counted(loss.views, 'camera')} {where}")]
 

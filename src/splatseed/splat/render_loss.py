@@ -6,7 +6,6 @@ packed file gives it back. Renders are clamped to [0, 1], as for scores.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
@@ -40,7 +39,8 @@ class RenderLoss(NamedTuple):
     scores: tuple[float, ...]
     """Mean PSNR of each stage against the photographs, dB; none without photographs."""
     likeness: tuple[float, ...]
-    """Mean PSNR of each stage but the first against the one before it, dB; infinite if equal."""
+    """PSNR of each stage but the first against the one before it, over the pixels of all views that
+    show something, dB; infinite if they are equal, NaN if no view shows anything."""
 
     def finding(self, suffix: str) -> Finding | None:
         """Return the finding on a packed file, the last stage; None if it is faithful."""
@@ -51,7 +51,7 @@ class RenderLoss(NamedTuple):
             text = f"Its {suffix} costs the model {before - after:.2f} dB: {before:.2f} before, "
             text += f"{after:.2f} as the file is read ({counted(self.views, 'test view')})."
         else:
-            if self.likeness[-1] >= MIN_LIKENESS:
+            if not self.likeness[-1] < MIN_LIKENESS:
                 return None
             text = f"Renders of the {suffix} differ from the model's: {self.likeness[-1]:.1f} dB "
             text += f"in {counted(self.views, 'view')}."
@@ -79,24 +79,21 @@ def measure_loss(
     """
     renderers = [ModelRenderer(stage, frame, device, background) for stage in stages]
     scores: list[list[float]] = []
-    likeness: list[list[float]] = []
+    errors, counts = np.zeros(len(stages) - 1), np.zeros(len(stages) - 1)
     for i, view in enumerate(views):
         images = [renderer.image(view).clamp(0, 1) for renderer in renderers]
         mask = mask_tensor(view, images[0].device)
         if view.photograph.size:
             photograph = photograph_tensor(view, images[0].device)
             scores.append([psnr(image, photograph, mask) for image in images])
-        found = []
-        for before, after in pairwise(images):
-            empty = before.new_tensor(background) / 255
-            differs = torch.maximum((before - empty).abs(), (after - empty).abs())
-            shown = (differs >= _DIFFERENT).any(dim=-1)
-            value = psnr(after, before, shown if mask is None else shown & mask)
-            found.append(math.inf if math.isnan(value) else value)
-        likeness.append(found)
+        empty = images[0].new_tensor(background) / 255
+        for j, pair in enumerate(pairwise(images)):
+            shown = (torch.stack(pair) - empty).abs().amax(dim=(0, -1)) >= _DIFFERENT
+            squares = (pair[1] - pair[0]).square()[shown if mask is None else shown & mask]
+            errors[j] += float(squares.sum(dtype=torch.float64))
+            counts[j] += squares.numel()
         progress("compare", (i + 1) / len(views))
-    means = (
-        tuple(float(x) for x in np.mean(rows, axis=0)) if rows else ()
-        for rows in (scores, likeness)
-    )
-    return RenderLoss(len(views), *means)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        likeness = -10 * np.log10(errors / counts)
+    means = np.mean(scores, axis=0) if scores else ()
+    return RenderLoss(len(views), tuple(map(float, means)), tuple(map(float, likeness)))
