@@ -37,7 +37,7 @@ MAX_MEASURED_LOGIT = 6.0
 gradient."""
 MIN_SHARE = 0.7
 """Of the Gaussians, the smallest share that a round keeps."""
-SHARES = (0.0, 0.02, 0.04, 0.06, 0.08, 0.1, 0.13, 0.16, 0.2)
+SHARES = (0.0, 0.02, 0.04, 0.06, 0.08, 0.1, 0.13, 0.16, 0.2, 0.25, 0.3, 0.4, 0.5)
 """By which Gaussians are widened, at most."""
 MAX_FITTED = 8
 """Training views in which sizes are fitted."""
