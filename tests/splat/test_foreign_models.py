@@ -361,6 +361,14 @@ def test_nodes_quantised_attributes_and_gltf_with_buffers_are_read(model, tmp_pa
     (tmp_path / "some data.bin").write_bytes(body)
     (tmp_path / "m.gltf").write_text(json.dumps(content))
     np.testing.assert_array_equal(read_gaussians(tmp_path / "m.gltf").means, found.means)
+    (first,) = content["meshes"][0]["primitives"]
+    plain = {name: index for name, index in first["attributes"].items() if "DEGREE_1" not in name}
+    content["meshes"][0]["primitives"] = [first, {**first, "attributes": plain}]
+    (tmp_path / "m.gltf").write_text(json.dumps(content))
+    both = read_gaussians(tmp_path / "m.gltf")
+    assert both.shN.shape == (2 * COUNT, 3, 3)
+    assert not both.shN[COUNT:].any()
+    np.testing.assert_array_equal(both.shN[:COUNT], found.shN)
     pytest.importorskip("torch", reason="turning harmonics needs PyTorch")
     half = np.sqrt(0.5)  # 90 degrees about z: x to y
     path = _write_glb(tmp_path / "m.glb", _attributes(model), {"rotation": [0, 0, half, half]})

@@ -18,11 +18,10 @@ from hypothesis import given, settings, strategies as st
 
 from splatseed.camera import rotation_from_quat
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError, SplatseedError
-from splatseed.similarity import Similarity
 from splatseed.splat.formats import WRITTEN_SUFFIXES, read_gaussians, write_gaussians
 from splatseed.splat.gaussians import Gaussians
-from splatseed.splat.model_frame import transform_gaussians
 from splatseed.splat.sog import _MAX_META
+from splatseed.splat.spz import axis_signs
 
 from .compressed import encode, write_any
 
@@ -302,7 +301,13 @@ def _upright(model, suffix, truth):
     low, high = truth.means.min(axis=0), model.means.min(axis=0)
     if suffix != ".spz" or np.abs(low - high).max() < 0.1:
         return model
-    return transform_gaussians(model, Similarity(1.0, np.diag([1.0, -1.0, -1.0]), np.zeros(3)))
+    signs = axis_signs(4)  # right, up, back
+    return replace(
+        model,
+        means=model.means * signs.position,
+        quats=model.quats * signs.quat,
+        shN=model.shN * signs.sh[: model.shN.shape[1], None],
+    )
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -328,3 +333,12 @@ def test_we_read_files_of_splat_transform(suffix, converter, tmp_path):
     theirs = _upright(read_gaussians(tmp_path / f"theirs{suffix}"), suffix, truth)
     _assert_close(theirs, read_gaussians(tmp_path / "as_they_read_it.ply"), same)
     assert np.abs(np.sort(theirs.means, axis=0) - np.sort(truth.means, axis=0)).max() < 0.02
+
+
+def test_we_read_gltf_of_splat_transform(converter, tmp_path):
+    truth = _gaussians()
+    write_gaussians(tmp_path / "ours.ply", truth)
+    converter(tmp_path / "ours.ply", tmp_path / "theirs.glb")
+    _assert_close(
+        read_gaussians(tmp_path / "theirs.glb"), truth, (1e-5, 1e-5, 0.1, 1e-5, 1e-5, 1e-5)
+    )

@@ -18,8 +18,10 @@ from splatseed.io.origin import RECENTER, choose_origin, format_offset, offset_b
 from splatseed.photos.view import NO_PIXELS
 from splatseed.progress import Note, Progress
 from splatseed.requirements import require, version_of
+from splatseed.scene import BLACK
 from splatseed.seeding.budget import parse_budget
 from splatseed.similarity import Similarity
+from splatseed.splat.background import background_of, name_background
 from splatseed.splat.formats import FORMATS, format_of_name, read_gaussians, write_gaussians
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.matrices import parse_similarity
@@ -56,7 +58,7 @@ class Options:
 
     model: Annotated[Path, tyro.conf.Positional]
     """A run folder of splatseed train, or a file of Gaussians: .ply, .compressed.ply, .splat, .spz,
-    .sog."""
+    .sog, .glb, or a checkpoint of gsplat, nerfstudio or graphdeco."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The file to write; its suffix chooses the format: .ply, .splat, .spz, .sog, or .html, a page
     with viewer and model that browsers open from disk."""
@@ -381,4 +383,7 @@ def _scoring_command(job: _Job) -> str:
     own = options.clean in {None, OWN} and options.scene is None
     if config.get("masks") is not None and own:
         words += ["--masks", quoted(config["masks"])]
+    background = None if config else background_of(job.path)
+    if background is not None and background != BLACK:
+        words += ["--background", name_background(background)]
     return " ".join(words)

@@ -57,19 +57,19 @@ def decode(path: Path, note: Note = silent_note) -> Gaussians:
                 found="points or meshes without this extension",
                 fix="As a scan, it is read by splatseed upsample SCENE --cloud.",
             )
-        degree = min(part.shN.shape[1] for part in parts)
-        if any(part.shN.shape[1] != degree for part in parts):
-            text = "Parts of the model have more harmonics than others: the least degree is used."
-            note(Finding("unused-harmonics", text))
-        parts = [dataclasses.replace(part, shN=part.shN[:, :degree]) for part in parts]
+        rest = max(part.shN.shape[1] for part in parts)
+        parts = [_padded(part, rest) for part in parts]
         signs = axis_signs(_LEFT_UP_FRONT)
-        arrays = {name: np.concatenate([getattr(p, name) for p in parts]) for name in PARAMETERS}
+        arrays: dict[str, Any] = {
+            name: np.concatenate([getattr(part, name) for part in parts]) for name in PARAMETERS
+        }
         text = "The axes of the model were read as glTF's: left, up, front."
         fix = "If it is upside down, they had not been converted (docs/models.md)."
         note(Finding("gltf-axes", text, "info", fix=fix))
         arrays["means"] = arrays["means"] * signs.position
-        arrays["quats"] = arrays["quats"] * signs.quat
-        arrays["shN"] = arrays["shN"] * signs.sh[:degree, None]
+        w, x, y, z = arrays["quats"].T
+        arrays["quats"] = np.stack([-z, -y, x, w], axis=1)  # turned by 180 degrees about z
+        arrays["shN"] = arrays["shN"] * signs.sh[:rest, None]
         return Gaussians(**arrays)
 
 
@@ -79,7 +79,8 @@ def _contents(path: Path) -> tuple[Mapping[str, Any], Sequence[bytes]]:
     if not data.startswith(MAGIC):
         content = json.loads(data)
         return content, [_buffer(path, each["uri"]) for each in content["buffers"]]
-    chunks, at = {}, 12
+    chunks: dict[int, bytes] = {}
+    at = 12
     while at + 8 <= len(data):
         length, kind = struct.unpack_from("<II", data, at)
         chunks.setdefault(kind, data[at + 8 : at + 8 + length])
@@ -117,6 +118,12 @@ def _placed(
                     scales=part.scales + np.float32(np.log(world.scale)),
                 )
             yield part
+
+
+def _padded(gaussians: Gaussians, rest: int) -> Gaussians:
+    """Add harmonics of 0 up to ``rest`` coefficients beyond the first."""
+    more = ((0, 0), (0, rest - gaussians.shN.shape[1]), (0, 0))
+    return dataclasses.replace(gaussians, shN=np.pad(gaussians.shN, more))
 
 
 def _check(path: Path, extension: Mapping[str, Any]) -> None:

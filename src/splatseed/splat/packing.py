@@ -85,7 +85,8 @@ class PackingSettings:
     uniform_share: float = 0.1  # of the cost of a lost Gaussian; the rest follows its solid angle
     max_blur: float = 0.5  # cost of a misplaced Gaussian, relative to a lost one
     visible: float = 1 / 64  # difference of a coefficient: about one of 255 steps of a colour
-    coarse_error: float = 0.1  # median rounding error, in sizes, that the user should know of
+    coarse_error: float = 0.1  # RMS rounding error of a position, in sizes, that may show
+    coarse_share: float = 0.25  # of such Gaussians, that is said: a few far ones do not show
     morton_bits: int = 21  # per axis; 63 in all
 
 
@@ -177,13 +178,13 @@ class Fit(NamedTuple):
     step: Float64[np.ndarray, " N"] | float
 
 
-def best_fit(gaussians: Gaussians, fits: Sequence[Fit]) -> tuple[int, float, float]:
-    """Choose the fit of least cost; return its index, lost share and median rounding error.
+def best_fit(gaussians: Gaussians, fits: Sequence[Fit]) -> tuple[int, float, int]:
+    """Choose the fit of least cost; return its index, lost share and number of coarse positions.
 
     The first fit of negligible cost wins. A Gaussian's weight is its opacity times its solid angle
     seen from the median position, plus a small uniform share. A dropped Gaussian costs its weight;
     a rounded one costs its weight times the squared error relative to its size, up to ``max_blur``.
-    The median error is relative to the size, too.
+    A position is coarse if its rounding error is more than ``coarse_error`` of the size.
     """
     distances, reach = distances_of(gaussians.means)
     sizes = np.exp(np.median(gaussians.scales, axis=1).astype(np.float64))
@@ -204,7 +205,21 @@ def best_fit(gaussians: Gaussians, fits: Sequence[Fit]) -> tuple[int, float, flo
     _, best, lost = min(costs)
     kept, step = fits[best]
     errors = (step / np.sqrt(12) / sizes)[kept]
-    return best, lost, float(np.median(errors)) if len(errors) else np.inf
+    return best, lost, int(np.count_nonzero(errors > PACKING.coarse_error))
+
+
+def coarse_findings(
+    suffix: str, coarse: int, kept: Bool[np.ndarray, " N"], steps: str = ""
+) -> list[Finding]:
+    """Report positions that are rounded coarsely, if they are more than a few."""
+    number = int(np.count_nonzero(kept))
+    if coarse <= PACKING.coarse_share * number:
+        return []
+    text = f"A {suffix} holds positions {steps}too coarsely for this model: those of "
+    text += f"{counted(coarse, 'Gaussian')} of {number:,} are rounded by more than a tenth of "
+    text += "their size."
+    fix = "Export another format, or move the model to the origin."
+    return [Finding("coarse-positions", text, fix=fix)]
 
 
 def left_out_finding(suffix: str, kept: Bool[np.ndarray, " N"], where: str) -> Finding:

@@ -26,10 +26,10 @@ from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.splat.cleaning import MAX_LOG_SCALE
 from splatseed.splat.gaussians import SH_COUNTS, Gaussians
 from splatseed.splat.packing import (
-    PACKING,
     Fit,
     best_fit,
     clipped_findings,
+    coarse_findings,
     from_smallest_three,
     left_out_finding,
     morton_order,
@@ -143,19 +143,13 @@ def _within_steps(gaussians: Gaussians, note: Note) -> Gaussians:
         kept = shells <= last
         step = np.ptp(curved[kept], axis=0) / 65535
         fits.append(Fit(kept, (step * np.exp(np.abs(curved))).max(axis=1)))
-    chosen, _, error = best_fit(gaussians, fits)
+    chosen, _, coarse = best_fit(gaussians, fits)
     kept = fits[chosen].kept
     if not kept.all():
         nearest = np.abs(gaussians.means[~kept]).max(axis=1).min()
         note(left_out_finding(".sog", kept, f"{nearest:,.4g} units or more from the origin"))
-    if error > PACKING.coarse_error:
-        note(
-            Finding(
-                "coarse-positions",
-                "A .sog is too coarse for the positions of this model: export another format, or "
-                "move the model to the origin.",
-            )
-        )
+    for finding in coarse_findings(".sog", coarse, kept):
+        note(finding)
     return gaussians if kept.all() else gaussians.select(kept)
 
 

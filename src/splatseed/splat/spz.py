@@ -26,10 +26,10 @@ from splatseed.requirements import require
 from splatseed.runtime.memory import check_memory
 from splatseed.splat.gaussians import SH_COUNTS, Gaussians
 from splatseed.splat.packing import (
-    PACKING,
     Fit,
     best_fit,
     clipped_findings,
+    coarse_findings,
     from_smallest_three,
     left_out_finding,
     morton_order,
@@ -128,7 +128,7 @@ def _fixed_point(gaussians: Gaussians, note: Note) -> tuple[Gaussians, int]:
     fits = [Fit(farthest <= _MAX_FIXED / 2.0**bits, 2.0**-bits) for bits in range(_MAX_BITS + 1)]
     complete = [bits for bits, fit in enumerate(fits) if fit.kept.all()]
     first = max(complete, default=0)
-    chosen, lost, error = best_fit(gaussians, fits[first:])
+    chosen, lost, coarse = best_fit(gaussians, fits[first:])
     bits = first + chosen
     kept, limit = fits[bits].kept, _MAX_FIXED / 2.0**bits
     if not kept.any() or (not complete and lost > _MAX_LOST_SHARE):
@@ -139,19 +139,13 @@ def _fixed_point(gaussians: Gaussians, note: Note) -> tuple[Gaussians, int]:
         )
     if not kept.all():
         note(left_out_finding(".spz", kept, f"more than {limit:,.4g} units from the origin"))
-    if error > PACKING.coarse_error:
-        steps = f"up to {limit:,.4g} units from the origin in steps of {2.0**-bits:.3g}"
-        note(
-            Finding(
-                "coarse-positions",
-                f"A .spz holds positions {steps}, too coarse for this model: export another "
-                "format, or move the model to the origin.",
-            )
-        )
+    steps = f"up to {limit:,.4g} units from the origin in steps of {2.0**-bits:.3g}, "
+    findings = coarse_findings(".spz", coarse, kept, steps)
     kept_ones = gaussians if kept.all() else gaussians.select(kept)
-    for finding in clipped_findings(
+    findings += clipped_findings(
         ".spz", kept_ones, sizes=_LOG_SCALES, first=_FIRST, further=_FURTHER
-    ):
+    )
+    for finding in findings:
         note(finding)
     return kept_ones, bits
 
