@@ -149,9 +149,9 @@ def _checked(options: Options) -> _Job:
     transform = None if options.transform is None else parse_similarity(options.transform)
     cleans = options.clean is not None
     config = config_of(options.model)
-    own = config.get("scene")
-    wanted = options.clean if cleans and options.clean != OWN else options.scene
-    scene = Path(wanted or own) if isinstance(wanted or own, str | Path) else None
+    wanted: Any = options.clean if cleans and options.clean != OWN else options.scene
+    wanted = wanted or config.get("scene")
+    scene = Path(wanted) if isinstance(wanted, str | Path) else None
     gone = options.clean == OWN and scene is not None and not scene.exists()
     refuse((gone, f"the scene of the run at {scene}", "none", "Say where it is: --clean SCENE."))
     named = cleans or options.scene is not None

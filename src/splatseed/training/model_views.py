@@ -101,8 +101,8 @@ def find_model_views(
             found = camera_views(images, factor)
         return tuple(view_in_model_frame(world, view) for view in found)
 
-    compared = test or train
-    compared = [compared[i] for i in evenly_spaced(len(compared), MAX_COMPARED)]
+    held_out = test or train
+    compared = [held_out[i] for i in evenly_spaced(len(held_out), MAX_COMPARED)]
     masked = scene.masks is not None
     views = views_of(train, pixels=masked)
     points = reference_points(scene)
