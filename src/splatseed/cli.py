@@ -24,7 +24,7 @@ VERBS = {
     "upsample": "Add points to a scene and write it for any 3DGS trainer.",
     "train": "Train 3D Gaussians on a scene, on a GPU or on the CPU.",
     "evaluate": "Score a trained model: PSNR, SSIM, FLIP, LPIPS.",
-    "export": "Write a trained model as .ply, .spz, .sog or .splat; crop it.",
+    "export": "Write a trained model as .ply, .spz, .sog, .splat; crop, thin it.",
     "view": "Look at scenes and models in the browser.",
     "flight": "Make a video of a flight through a trained model, or pictures.",
     "bench": "Compare methods by training: many runs, resumable, then a report.",

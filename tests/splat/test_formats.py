@@ -18,7 +18,6 @@ from hypothesis import given, settings, strategies as st
 
 from splatseed.camera import rotation_from_quat
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError, SplatseedError
-from splatseed.splat import formats
 from splatseed.splat.formats import WRITTEN_SUFFIXES, read_gaussians, write_gaussians
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.sog import _MAX_META
@@ -277,20 +276,6 @@ def test_axes_named_in_an_spz_are_converted(version, tmp_path):
         np.testing.assert_allclose(*colors, atol=1e-4)
     with pytest.raises(SceneFormatError, match="SPZ_ADOBE_coordinate_system"):
         read_as(12)
-
-
-def test_crop_and_min_opacity_filter_gaussians():
-    model = _gaussians()
-    kept = formats.filter_gaussians(model, formats.parse_crop("-1,-2,-3,1,2,3"), 0.25)
-    inside = (np.abs(model.means) <= [1, 2, 3]).all(axis=1)
-    opaque = 1 / (1 + np.exp(-model.opacities)) >= 0.25
-    np.testing.assert_array_equal(kept.means, model.means[inside & opaque])
-    assert formats.filter_gaussians(model) is model
-    with pytest.raises(ParameterError, match="none of 700"):
-        formats.filter_gaussians(model, formats.parse_crop("90,90,90,91,91,91"))
-    for text in ("0,0,0,1,1,0", "a,b,c,d,e,f", "0,0,0,1,1,nan"):
-        with pytest.raises(ParameterError, match="`crop"):
-            formats.parse_crop(text)
 
 
 # The formats' own tool ---------------------------------------------------------------------------

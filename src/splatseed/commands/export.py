@@ -2,44 +2,59 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
 
 from splatseed.commands.options import check_free, parse_options, refuse
 from splatseed.console import print_note, print_pairs, stage_display
+from splatseed.errors import InputError, ParameterError
 from splatseed.findings import Finding
 from splatseed.io.origin import RECENTER, choose_origin, format_offset, offset_beside, write_offset
+from splatseed.photos.view import NO_PIXELS
 from splatseed.progress import Note, Progress
-from splatseed.requirements import require
+from splatseed.requirements import require, version_of
 from splatseed.scene import BLACK
+from splatseed.seeding.budget import parse_budget
+from splatseed.similarity import Similarity
 from splatseed.splat.background import background_of, name_background
-from splatseed.splat.formats import (
-    FORMATS,
-    filter_gaussians,
-    format_of_name,
-    parse_crop,
-    read_gaussians,
-    write_gaussians,
-)
+from splatseed.splat.formats import FORMATS, format_of_name, read_gaussians, write_gaussians
 from splatseed.splat.gaussians import Gaussians
-from splatseed.splat.model_frame import translate_gaussians
-from splatseed.text import quoted, visible
+from splatseed.splat.matrices import parse_similarity
+from splatseed.splat.model_frame import transform_gaussians, translate_gaussians
+from splatseed.splat.selection import (
+    Region,
+    filter_gaussians,
+    isolated,
+    kept_by_filter,
+    largest,
+    parse_crop,
+    visible_area,
+)
+from splatseed.text import counted, quoted, visible
 from splatseed.training.folder import RunFolder, config_of, model_file
 from splatseed.training.settings import TrainSettings
+
+if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
+    from splatseed.splat.render_loss import RenderLoss
+    from splatseed.training.model_views import ModelViews
 
 PAGE = ".html"
 PAGE_DESCRIPTION = "html: one colour per Gaussian, their mean over the training cameras; browsers"
 OWN = "own"
 """The value of --clean for the scene of the run."""
+LOSSLESS = "ply"
+NUM_CAMERAS, CAMERA_SIZE = 6, (480, 360)
+"""Cameras that circle a model without a scene, and their width and height."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Write a trained model in another format or as a web page, optionally cropped and cleaned."""
+    """Write a trained model in another format or as a web page; crop, thin, clean or move it."""
 
     model: Annotated[Path, tyro.conf.Positional]
     """A run folder of splatseed train, or a file of Gaussians: .ply, .compressed.ply, .splat, .spz,
@@ -47,89 +62,210 @@ class Options:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The file to write; its suffix chooses the format: .ply, .splat, .spz, .sog, or .html, a page
     with viewer and model that browsers open from disk."""
-    crop: Annotated[str | None, tyro.conf.arg(metavar="x0,y0,z0,x1,y1,z1")] = None
-    """Keep the Gaussians whose centres lie in this box, in world coordinates; write --crop=-1,...
-    if the first number is negative."""
+    scene: Path | None = None
+    """The scene of a file of Gaussians, for --budget and the score that the format costs; a run has
+    its own."""
+    crop: Annotated[str | None, tyro.conf.arg(metavar="x0,y0,z0,x1,y1,z1|x,y,z,r|FILE")] = None
+    """Keep the Gaussians whose centres lie in this box, sphere (centre, radius), or turned box (a
+    file or 16 numbers: the matrix from a cube of side 1 around 0), in the model's coordinates;
+    write --crop=-1,... if the first number is negative."""
     min_opacity: float = 0.0
     """Remove Gaussians of a lower opacity, 0 to 1."""
     clean: Annotated[str | None, tyro.conf.arg(metavar="SCENE|own")] = None
     """Remove floaters, Gaussians where the photographs of this scene show free space; own: the
     scene of the run."""
+    drop_isolated: bool = False
+    """Remove Gaussians far from all others for their size: floaters, without photographs."""
+    budget: Annotated[str | None, tyro.conf.arg(metavar="N")] = None
+    """Keep at most this many Gaussians, such as 50k: those that change the renders of the training
+    views most; without a scene, those of the largest opacity times area."""
+    transform: Annotated[str | None, tyro.conf.arg(metavar="FILE|16 numbers")] = None
+    """Move the model by a matrix from old to new coordinates, row by row: a rotation, one scale and
+    a translation. Sizes and view-dependent colours follow."""
     overwrite: bool = False
     """Replace an existing file."""
 
 
+@dataclass(frozen=True)
+class _Job:
+    """What is exported, checked before any work."""
+
+    options: Options
+    path: Path  # of the model's Gaussians
+    format: str  # a name of FORMATS, or PAGE
+    config: Mapping[str, Any]  # of the run; empty for other models
+    scene: Path | None  # of the model, if it is known and there
+    crop: Region | None
+    transform: Similarity | None
+    budget: int | None
+
+    @property
+    def is_page(self) -> bool:
+        """Whether a web page is written."""
+        return self.format == PAGE
+
+
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
-    options = parse_options(Options, "export", arguments)
-    page = options.output.name.lower().endswith(PAGE)
-    name = PAGE if page else format_of_name(options.output, (PAGE,))
+    job = _checked(parse_options(Options, "export", arguments))
+    target, findings = job.options.output, list[Finding]()
+    with stage_display() as clock:
+        clock("read", 0.0)
+        gaussians = read_gaussians(job.path, findings.append)
+        cropped = filter_gaussians(gaussians, job.crop)
+        views = _views(job, gaussians, clock, findings.append)
+        kept, rows = _kept(job, gaussians, views, clock)
+        stages = {"model": cropped}
+        if len(kept) < len(cropped):
+            stages["kept"] = kept
+        if job.is_page:
+            _write_page(job, kept, clock, findings.append)
+        else:
+            placed = _write_file(job, kept, clock, findings.append)
+            if job.format != LOSSLESS:
+                stages["file"] = transform_gaussians(read_gaussians(target), placed.inverse)
+        loss = _loss(stages, views, cropped=job.crop is not None, progress=clock)
+    before, after = job.path.stat().st_size, target.stat().st_size
+    described = PAGE_DESCRIPTION if job.is_page else FORMATS[job.format].description
+    rows = [
+        ("Gaussians", f"{len(kept):,} of {len(gaussians):,}"),
+        *rows,
+        *_loss_rows(loss, stages, views),
+        ("format", described if job.is_page else f"{job.format}: {described}"),
+        ("size", f"{after / 1e6:.2f} MB, of {before / 1e6:.2f} MB read"),
+        ("output", str(target)),
+    ]
+    print_pairs("splatseed export", rows)
+    print_note(*findings, *_format_findings(job), *_loss_findings(loss, stages, job))
+    _print_next(job)
+
+
+def _checked(options: Options) -> _Job:
+    """Refuse what cannot be exported, before any work."""
+    target, path = options.output, model_file(options.model)
+    page = target.name.lower().endswith(PAGE)
+    name = PAGE if page else format_of_name(target, (PAGE,))
     crop = None if options.crop is None else parse_crop(options.crop)
-    path, target = model_file(options.model), options.output
+    transform = None if options.transform is None else parse_similarity(options.transform)
     cleans = options.clean is not None
-    config = config_of(options.model) if cleans else {}
-    scene = config.get("scene") if options.clean == OWN else options.clean
-    inputs = [Path(scene)] if isinstance(scene, str) else []
-    moved = options.clean == OWN and isinstance(scene, str) and not Path(scene).exists()
-    refuse((moved, f"the scene of the run at {scene}", "none", "Say where it is: --clean SCENE."))
-    check_free(target, overwrite=options.overwrite, protect=inputs)
+    config = config_of(options.model)
+    wanted: Any = options.clean if cleans and options.clean != OWN else options.scene
+    wanted = wanted or config.get("scene")
+    scene = Path(wanted) if isinstance(wanted, str | Path) else None
+    gone = options.clean == OWN and scene is not None and not scene.exists()
+    refuse((gone, f"the scene of the run at {scene}", "none", "Say where it is: --clean SCENE."))
+    named = cleans or options.scene is not None
+    check_free(target, overwrite=options.overwrite, protect=[scene] if scene and named else [])
     refuse(
-        (options.clean == OWN and not isinstance(scene, str),
+        (options.clean == OWN and scene is None,
          f"--clean SCENE, as {options.model} does not name its scene", OWN,
          "Name the scene that it was trained on."),
         (target.exists() and target.samefile(path), f"another file than {target}", "the model's",
          "Choose another name."),
         (RunFolder(target.resolve().parent).is_run, f"a file outside training runs, not {target}",
          "the folder of a run", "Choose a place beside the run."),
+        (options.scene is not None and not options.scene.exists(), f"a scene at {options.scene}",
+         "none", "Check the path."),
+        (page and transform is not None, "--transform for a file of Gaussians", "a web page",
+         "A page shows the model in its scene's frame: leave it out."),
     )  # fmt: skip
     if cleans or page:
         require("torch", *["viser"] * page)
-    findings: list[Finding] = []
-    with stage_display() as clock:
-        clock("read", 0.0)
-        gaussians = read_gaussians(path, findings.append)
-        # What leaves nothing is refused before photographs are compared.
-        kept = filter_gaussians(gaussians, crop, options.min_opacity)
-        floaters = np.zeros(len(gaussians), bool)
-        if cleans:
-            from splatseed.training.floaters import floaters_of_model
-
-            names = ("data_factor", "test_every")
-            numbers = {n: value for n in names if isinstance(value := config.get(n), int)}
-            masks = config.get("masks")
-            floaters = floaters_of_model(
-                path, Path(str(scene)), masks=masks, progress=clock, **numbers
-            )
-            kept = filter_gaussians(gaussians.select(~floaters), crop, options.min_opacity)
-        if page:
-            _write_page(options.model, path, kept, target, clock, findings.append)
-        else:
-            _write_file(path, kept, target, clock, findings.append)
-    before, after = path.stat().st_size, target.stat().st_size
-    rows = [
-        ("Gaussians", f"{len(kept):,} of {len(gaussians):,}"),
-        *[("floaters", f"{np.count_nonzero(floaters):,} left out")] * cleans,
-        ("format", PAGE_DESCRIPTION if page else f"{name}: {FORMATS[name].description}"),
-        ("size", f"{after / 1e6:.2f} MB, of {before / 1e6:.2f} MB read"),
-        ("output", str(target)),
-    ]
-    print_pairs("splatseed export", rows)
-    if path.suffix.lower() == ".spz" != target.suffix.lower():
-        text = "The axes of the .spz were read as right, up, back, as specified."
-        fix = "If the result is upside down, they had not been converted (docs/models.md)."
-        findings.append(Finding("spz-axes", text, "info", fix=fix))
-    print_note(*findings)
-    if page:
-        link = visible(target.resolve().as_uri())
-        print_pairs("next", [("open it in a browser, here or wherever you send it", link)])
-    else:
-        looking = ("look at it", f"splatseed view {quoted(options.output)}")
-        print_pairs("next", [looking, ("score it", _scoring_command(options))])
+    budget = None if options.budget is None else parse_budget(options.budget, 0)
+    if not named and scene is not None and not scene.exists():
+        scene = None  # the run was made elsewhere
+    return _Job(options, path, name, config, scene, crop, transform, budget)
 
 
-def _write_file(path: Path, kept: Gaussians, target: Path, progress: Progress, note: Note) -> None:
-    offset, far = offset_beside(path), choose_origin(kept.means)
-    kept = translate_gaussians(kept, -far) if far.any() else kept
+def _views(job: _Job, gaussians: Gaussians, progress: Progress, note: Note) -> ModelViews | None:
+    """Find the views of the model's scene, if they are needed and there.
+
+    Those of a scene that the user names are an error if they cannot be used.
+    """
+    needed = job.budget is not None or not (job.is_page or job.format == LOSSLESS)
+    if job.scene is None or not needed:
+        return None
+    named = job.options.scene is not None
+    if not named and not all(map(version_of, ("torch", "gsplat"))):
+        return None
+    require("torch", "gsplat")
+    from splatseed.training.model_views import find_model_views
+
+    try:
+        return find_model_views(job.path, gaussians, job.scene, job.config, progress)
+    except InputError as error:
+        if named:
+            raise
+        text = f"The model is not compared with the photographs of {job.scene}: {error}"
+        note(Finding("scene-not-used", text, "info"))
+        return None
+
+
+def _kept(
+    job: _Job, gaussians: Gaussians, views: ModelViews | None, progress: Progress
+) -> tuple[Gaussians, list[tuple[str, str]]]:
+    """Choose the Gaussians to write; also return rows that tell what was left out."""
+    options, rows = job.options, list[tuple[str, str]]()
+    # What leaves nothing is refused before photographs are compared.
+    keep = kept_by_filter(gaussians, job.crop, options.min_opacity)
+    if options.clean is not None:
+        from splatseed.training.floaters import floaters_of_model
+
+        numbers = {
+            name: value
+            for name in ("data_factor", "test_every")
+            if isinstance(value := job.config.get(name), int)
+        }
+        masks = job.config.get("masks")
+        bad = floaters_of_model(
+            job.path, Path(str(job.scene)), masks=masks, progress=progress, **numbers
+        )
+        rows.append(("floaters", f"{np.count_nonzero(bad):,} left out"))
+        keep &= ~bad
+    if options.drop_isolated:
+        bad = isolated(gaussians)
+        rows.append(("isolated", f"{np.count_nonzero(bad & keep):,} left out"))
+        keep &= ~bad
+    if not keep.any():
+        raise ParameterError(
+            "Gaussians that are left", found=f"none of {len(gaussians):,}",
+            fix="Leave one of `crop`, `min_opacity`, `clean` and `drop_isolated` out.",
+        )  # fmt: skip
+    kept = gaussians if keep.all() else gaussians.select(keep)
+    if job.budget is not None and job.budget < len(kept):
+        kept, how = _within_budget(job.budget, kept, views, progress)
+        rows.append(("budget", f"{job.budget:,}, {how}"))
+    return kept, rows
+
+
+def _within_budget(
+    budget: int, gaussians: Gaussians, views: ModelViews | None, progress: Progress
+) -> tuple[Gaussians, str]:
+    """Thin Gaussians to a budget; also return how, in words."""
+    if views is None:
+        kept = gaussians.select(largest(visible_area(gaussians), budget))
+        return kept, "by opacity and area; name the --scene for a better choice"
+    from splatseed.training.decimation import fit_sizes, most_needed
+    from splatseed.training.floaters import render_device
+
+    device = render_device(progress)
+    kept = gaussians.select(most_needed(gaussians, views, budget, device, progress))
+    kept, share = fit_sizes(kept, gaussians, views, device, progress)
+    how = f"by what changes in {counted(len(views.train), 'training view')}"
+    return kept, how + (f"; sizes + {share:.0%}" if share else "")
+
+
+def _write_file(job: _Job, kept: Gaussians, progress: Progress, note: Note) -> Similarity:
+    """Write the Gaussians, and the file with their offset; return how they were moved."""
+    path, target = job.path, job.options.output
+    moved, offset = Similarity(1.0, np.eye(3), np.zeros(3)), offset_beside(path)
+    if job.transform is not None:
+        moved, offset = job.transform, None  # into a frame of the user's
+        kept = transform_gaussians(kept, moved)
+    far = choose_origin(kept.means)
+    if far.any():
+        kept = translate_gaussians(kept, -far)
+        moved = moved.then(Similarity(1.0, np.eye(3), -far))
     offset = far if offset is None else offset + far
     write_gaussians(target, kept, progress, note)
     write_offset(target, offset)
@@ -142,26 +278,98 @@ def _write_file(path: Path, kept: Gaussians, target: Path, progress: Progress, n
                 "info",
             )
         )
+    return moved
 
 
-def _write_page(
-    model: Path, path: Path, kept: Gaussians, target: Path, progress: Progress, note: Note
-) -> None:
+def _write_page(job: _Job, kept: Gaussians, progress: Progress, note: Note) -> None:
     """Write the Gaussians as a web page, named after the run or the file."""
     from splatseed.viewer.models import item_of_model
     from splatseed.viewer.web_page import check_page_size, write_page
 
+    model = job.options.model
     check_page_size(len(kept))
     name = model.resolve().name if model.is_dir() else model.stem
-    item = item_of_model(name, path, kept, note)
-    write_page(target, item, progress, note)
+    item = item_of_model(name, job.path, kept, note)
+    write_page(job.options.output, item, progress, note)
 
 
-def _scoring_command(options: Options) -> str:
+def _loss(
+    stages: Mapping[str, Gaussians], views: ModelViews | None, *, cropped: bool, progress: Progress
+) -> RenderLoss | None:
+    """Compare renders of the stages of a model; None for a single one, or without PyTorch.
+
+    A model without a scene is rendered from cameras around it. Photographs show more than a crop.
+    """
+    if len(stages) < 2 or version_of("torch") is None:
+        return None
+    from splatseed.splat.render_loss import measure_loss
+    from splatseed.splat.training_frame import NO_POINTS, frame_of_model
+    from splatseed.training.floaters import render_device
+
+    models, device = list(stages.values()), render_device(progress)
+    if views is None:
+        from splatseed.viewer.flights import orbit
+
+        around = orbit([], models[0], NUM_CAMERAS, CAMERA_SIZE)
+        frame = frame_of_model(around, NO_POINTS, models[0])
+        return measure_loss(models, around, frame, device, progress)
+    test = [replace(view, photograph=NO_PIXELS) if cropped else view for view in views.test]
+    return measure_loss(models, test, views.frame, device, progress, views.background)
+
+
+def _loss_rows(
+    loss: RenderLoss | None, stages: Mapping[str, Gaussians], views: ModelViews | None
+) -> list[tuple[str, str]]:
+    """Return the row with the score of each stage, or with how alike they look."""
+    if loss is None:
+        return []
+    if loss.scores:
+        scores = ", ".join(f"{n} {x:.2f} dB" for n, x in zip(stages, loss.scores, strict=True))
+        return [("score", f"{scores}; PSNR, {counted(loss.views, 'test view')}")]
+    where = "around it" if views is None else "of its scene"
+    alike = ", ".join(
+        f"{name} {x:.1f} dB"
+        if np.isfinite(x)
+        else f"{name} {'not seen' if np.isnan(x) else 'equal'}"
+        for name, x in zip(list(stages)[1:], loss.likeness, strict=True)
+    )
+    return [("likeness", f"{alike}; PSNR of renders, {counted(loss.views, 'camera')} {where}")]
+
+
+def _loss_findings(
+    loss: RenderLoss | None, stages: Mapping[str, Gaussians], job: _Job
+) -> list[Finding]:
+    found = loss.finding(job.options.output.suffix) if loss and "file" in stages else None
+    return [found] if found else []
+
+
+def _format_findings(job: _Job) -> list[Finding]:
+    """Return what is to be known of the format of the file read."""
+    findings = []
+    if job.path.suffix.lower() == ".spz" != job.options.output.suffix.lower():
+        text = "The axes of the .spz were read as right, up, back, as specified."
+        fix = "If the result is upside down, they had not been converted (docs/models.md)."
+        findings.append(Finding("spz-axes", text, "info", fix=fix))
+    return findings
+
+
+def _print_next(job: _Job) -> None:
+    options = job.options
+    if job.is_page:
+        link = visible(options.output.resolve().as_uri())
+        print_pairs("next", [("open it in a browser, here or wherever you send it", link)])
+        return
+    rows = [("look at it", f"splatseed view {quoted(options.output)}")]
+    if job.transform is None:  # else its scene is elsewhere
+        rows.append(("score it", _scoring_command(job)))
+    print_pairs("next", rows)
+
+
+def _scoring_command(job: _Job) -> str:
     """Return the command that scores the file as its run was; unknown values are placeholders."""
-    config = config_of(options.model)
+    options, config = job.options, job.config
     scene, factor, every = (config.get(name) for name in ("scene", "data_factor", "test_every"))
-    scene = scene if options.clean in {None, OWN} else options.clean
+    scene = str(job.scene) if job.scene is not None else scene
     words = ["splatseed evaluate", quoted(options.output)]
     words += ["--scene", quoted(scene) if isinstance(scene, str) else "SCENE"]
     if not isinstance(factor, int):
@@ -172,9 +380,10 @@ def _scoring_command(options: Options) -> str:
         words += ["--data-factor", str(factor)]
     if isinstance(every, int) and every != TrainSettings.test_every:
         words += ["--test-every", str(every)]
-    if config.get("masks") is not None and options.clean in {None, OWN}:
+    own = options.clean in {None, OWN} and options.scene is None
+    if config.get("masks") is not None and own:
         words += ["--masks", quoted(config["masks"])]
-    background = None if config else background_of(model_file(options.model))
+    background = None if config else background_of(job.path)
     if background is not None and background != BLACK:
         words += ["--background", name_background(background)]
     return " ".join(words)

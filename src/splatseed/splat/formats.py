@@ -1,4 +1,4 @@
-"""Read and write files of Gaussians, and filter them by position and opacity.
+"""Read and write files of Gaussians.
 
 The content decides the format on reading, the file name on writing. Writing is atomic. Gaussians
 that cannot be drawn are dropped on reading (``cleaning.py``). A .ply is lossless; packed formats
@@ -17,9 +17,6 @@ from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
-
-import numpy as np
-from jaxtyping import Float64
 
 from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io.files import ARCHIVE_FAILURES, COPY_AGAIN, StrPath, read_bytes
@@ -257,47 +254,3 @@ def holds_gaussians(path: Path) -> bool:
     except SceneFormatError:
         return False
     return kind != "ply" or _SCALE_IN_PLY.search(data, 0, _HEADER) is not None
-
-
-def parse_crop(text: str) -> Float64[np.ndarray, "2 3"]:
-    """Parse a box of six comma-separated numbers: minimum x, y, z, then maximum x, y, z.
-
-    Example:
-        >>> parse_crop("-1,-1,-1,1,1,2").tolist()
-        [[-1.0, -1.0, -1.0], [1.0, 1.0, 2.0]]
-    """
-    try:
-        low, high = np.array([float(part) for part in text.split(",")]).reshape(2, 3)
-    except ValueError:
-        low = high = np.zeros(3)
-    if not (low < high).all():
-        raise ParameterError(
-            "`crop=x0,y0,z0,x1,y1,z1`, the minimum and maximum corners of a box",
-            found=repr(text),
-            fix="splatseed info SCENE prints the bounding box of the points.",
-        )
-    return np.stack([low, high])
-
-
-def filter_gaussians(
-    gaussians: Gaussians, crop: Float64[np.ndarray, "2 3"] | None = None, min_opacity: float = 0.0
-) -> Gaussians:
-    """Keep Gaussians with centres in the box ``crop`` and at least ``min_opacity``, in order."""
-    if not 0 <= min_opacity < 1:
-        raise ParameterError(
-            "`min_opacity` of 0 or more, less than 1", found=f"{min_opacity}", fix="Try 0.05."
-        )
-    keep = np.ones(len(gaussians), bool)
-    if min_opacity:
-        keep &= gaussians.opacities >= np.log(min_opacity / (1 - min_opacity))
-    if crop is not None:
-        keep &= ((gaussians.means >= crop[0]) & (gaussians.means <= crop[1])).all(axis=1)
-    if not keep.any():
-        ends = (end(gaussians.means, axis=0) for end in (np.min, np.max))
-        low, high = (" ".join(f"{value:.4g}" for value in end) for end in ends)
-        raise ParameterError(
-            "`crop` and `min_opacity` to leave some Gaussians",
-            found=f"none of {len(gaussians):,}, whose centres lie from {low} to {high}",
-            fix="Choose a larger box or a smaller opacity.",
-        )
-    return gaussians if keep.all() else gaussians.select(keep)

@@ -92,13 +92,16 @@ def floaters_of_model(
         settings = replace(settings, data_factor=factor_for(images, StereoSettings.max_size))
     factor, cache = settings.factor, user_cache_dir()
     views = load_views(scene, images, data_factor=factor, cache_dir=cache, progress=progress)
-    frame, device = frame_of_model(views, reference_points(scene), gaussians), _device(progress)
+    frame, device = (
+        frame_of_model(views, reference_points(scene), gaussians),
+        render_device(progress),
+    )
     depths, _ = known_depths(scene, frame.scale, settings, device.type, progress=progress)
     views = tuple(frame.view(view) for view in views)
     return find_floaters(frame.gaussians_from_world(gaussians), views, depths, device, progress)
 
 
-def _device(progress: Progress) -> torch.device:
+def render_device(progress: Progress) -> torch.device:
     """Return a GPU if gsplat has kernels for it; the CPU finds the same floaters."""
     try:
         return pick_device("auto", progress)
