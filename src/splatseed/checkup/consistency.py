@@ -16,8 +16,9 @@ length, or points that are random, turned, or scaled by 1.3.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -74,7 +75,16 @@ _HALF, _REACH = CONSISTENCY.half_patch, CONSISTENCY.reach
 _PATCH = 2 * _HALF + 1
 
 
-@dataclass(frozen=True)
+class Matches(NamedTuple):
+    """Where patches of a view are found again in another, near the places where they should be."""
+
+    uv: Float64[np.ndarray, "M 2"]  # pixels of the first view
+    depth: Float64[np.ndarray, " M"]  # of the plane that carries the patch to the second view
+    shift: Float64[np.ndarray, "M 2"]
+    """From ``uv`` to the pixel of the first view that the plane carries to the place found."""
+
+
+@dataclass(frozen=True, eq=False)
 class PairFit:
     """How the points that two views share fit them."""
 
@@ -84,9 +94,10 @@ class PairFit:
     tested: int  # with a patch that is not bare; those outside of the first view count
     by_chance: int  # of ``moved`` ones
     moved: int
+    matches: Matches
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fit:
     """How points fit photographs, over all pairs."""
 
@@ -129,6 +140,8 @@ class Hypothesis:
     xyz: Float64[np.ndarray, "P 3"]
     focal_factor: float = 1.0  # by which focal lengths are multiplied
     center_factor: float = 1.0  # by which principal points are multiplied
+    view_factors: Mapping[int, float] = field(default_factory=dict)
+    """By which the focal lengths of some views are multiplied, by index."""
 
 
 @dataclass(eq=False)
@@ -176,7 +189,7 @@ class Evidence:
         self._load({i for pair in compared for i in pair}, progress)
         for number, (i, j) in enumerate(compared):
             progress("compare photographs with points", number / len(compared))
-            cameras = [self._camera(k, hypothesis) for k in (i, j)]
+            cameras = self.cameras(i, j, hypothesis)
             rows = strided(self._common(i, j, cameras, hypothesis.xyz), points)
             if len(rows) < CONSISTENCY.min_points:
                 continue
@@ -228,10 +241,14 @@ class Evidence:
         for i, view in zip(missing, views, strict=True):
             self._loaded[i] = view, np.asarray(view.photograph.mean(axis=2))
 
+    def cameras(self, i: int, j: int, hypothesis: Hypothesis) -> tuple[Camera, Camera]:
+        """The cameras of two views that were compared, in pixels of the reduced photographs."""
+        return self._camera(i, hypothesis), self._camera(j, hypothesis)
+
     def _camera(self, i: int, hypothesis: Hypothesis) -> Camera:
         view = self._loaded[i][0]
         K = view.K.copy()
-        K[:2, :2] *= hypothesis.focal_factor
+        K[:2, :2] *= hypothesis.focal_factor * hypothesis.view_factors.get(i, 1.0)
         K[:2, 2] *= hypothesis.center_factor
         return Camera(K, view.width, view.height, hypothesis.poses[i])
 
@@ -257,14 +274,14 @@ class Evidence:
             uv = _pixels(cameras[0], xyz[inside])
             inside[inside] = view.mask[uv[:, 1], uv[:, 0]]
         within, center = xyz[inside], cameras[0].center
-        confirmed, textured = _confirm(grey, other, cameras, within)
+        confirmed, textured, matches = _confirm(grey, other, cameras, within)
         by_chance = moved = 0
         for number, factor in enumerate(CONSISTENCY.moves):  # a part of the points each
             part = within[number :: len(CONSISTENCY.moves)]
             away = center + factor * (part - center)
-            chance, tested = _confirm(grey, other, cameras, away)
+            chance, tested, _ = _confirm(grey, other, cameras, away)
             by_chance, moved = by_chance + chance, moved + tested
-        return PairFit(i, j, confirmed, textured + outside, by_chance, moved), inside
+        return PairFit(i, j, confirmed, textured + outside, by_chance, moved, matches), inside
 
 
 def _nearest_points(camera: Camera, xyz: Float64[np.ndarray, "P 3"]) -> Int64[np.ndarray, " M"]:
@@ -281,8 +298,8 @@ def _pixels(camera: Camera, xyz: Float64[np.ndarray, "M 3"]) -> Int64[np.ndarray
 
 def _confirm(
     grey: Grey, other: Grey, cameras: Sequence[Camera], xyz: Float64[np.ndarray, "M 3"]
-) -> tuple[int, int]:
-    """Return how many points of a view another confirms, and how many have a patch to search."""
+) -> tuple[int, int, Matches]:
+    """Return how many points of a view another confirms, how many have a patch, and its places."""
     first, second = cameras
     column, row, depth = project(first.pixels_from_world, xyz)
     uv = np.stack([column, row], axis=1)[:, None, None]
@@ -292,7 +309,7 @@ def _confirm(
     with np.errstate(invalid="ignore"):
         textured = norms >= CONSISTENCY.min_contrast * _PATCH
     if not textured.any():
-        return 0, 0
+        return 0, 0, Matches(np.empty((0, 2)), np.empty(0), np.empty((0, 2)))
     patches, norms = patches[textured] / norms[textured, None, None], norms[textured]
     # X_j = z (R K_i^-1) (u, v, 1) + t for the plane at depth z that faces i.
     relative = second.cam_from_world @ first.world_from_cam
@@ -307,11 +324,35 @@ def _confirm(
     windows = sliding_window_view(bands, (_PATCH, _PATCH), axis=(1, 2))
     deviation = windows.std(axis=(-1, -2)) * _PATCH
     scores = np.einsum("nabij,nij->nab", windows, patches) / np.maximum(deviation, 1e-3)
-    scores = np.where(np.isfinite(scores), scores, -1.0).reshape(len(scores), -1)
-    best = scores.argmax(axis=1)
+    scores = np.where(np.isfinite(scores), scores, -1.0)
+    best = scores.reshape(len(scores), -1).argmax(axis=1)
     miss = np.linalg.norm(_grid(_REACH).reshape(-1, 2)[best], axis=1)
-    found = scores[np.arange(len(best)), best] >= CONSISTENCY.min_correlation
-    return int(np.count_nonzero(found & (miss <= CONSISTENCY.max_miss))), len(scores)
+    row, column = np.divmod(best, scores.shape[2])
+    found = scores[np.arange(len(best)), row, column] >= CONSISTENCY.min_correlation
+    confirmed = int(np.count_nonzero(found & (miss <= CONSISTENCY.max_miss)))
+    # At the border of what is searched the best place may lie beyond.
+    for at in (row, column):
+        found &= (at > 0) & (at < 2 * _REACH)
+    at = np.flatnonzero(found), row[found], column[found]
+    shift = np.stack([_peak(scores, at, (0, 1)), _peak(scores, at, (1, 0))], axis=1)
+    shift += np.stack([column[found], row[found]], axis=1) - _REACH
+    matches = Matches(uv[textured][found, 0, 0], depth[textured][found], shift)
+    return confirmed, len(scores), matches
+
+
+def _peak(
+    scores: Float64[np.ndarray, "N S S"],
+    at: tuple[Int64[np.ndarray, " M"], Int64[np.ndarray, " M"], Int64[np.ndarray, " M"]],
+    step: tuple[int, int],
+) -> Float64[np.ndarray, " M"]:
+    """The peak of the parabola through three correlations, in pixels from the middle one."""
+    n, row, column = at
+    before, after = (
+        scores[n, row - step[0], column - step[1]],
+        scores[n, row + step[0], column + step[1]],
+    )
+    bend = 2 * scores[at] - before - after
+    return np.where(bend > 0, 0.5 * (after - before) / np.where(bend > 0, bend, 1.0), 0.0)
 
 
 def _grid(half: int) -> Float64[np.ndarray, "S S 2"]:

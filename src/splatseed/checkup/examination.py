@@ -17,6 +17,13 @@ import numpy as np
 
 from splatseed.checkup.choices import UnfitPoints
 from splatseed.checkup.consistency import Evidence, Fit
+from splatseed.checkup.distortion import distortion_finding, find_distortion
+from splatseed.checkup.focal_lengths import (
+    WRONG_FOCAL_LENGTH,
+    camera_groups,
+    find_focal_factors,
+    focal_factor_findings,
+)
 from splatseed.checkup.hypotheses import Affine, Found, find_axes, find_intrinsics, find_similarity
 from splatseed.checkup.poses import WrongConventionError, check_poses, compare_samples
 from splatseed.depth.stereo.maps import MIN_POINTS, StereoMap
@@ -28,7 +35,6 @@ from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 
 UNFIT_POINTS = "points-do-not-fit"
-WRONG_FOCAL_LENGTH = "wrong-focal-length"
 
 
 @dataclass(frozen=True)
@@ -106,9 +112,8 @@ def _examine(scene: Scene, images: Sequence[Image], progress: Progress) -> Check
     fit = evidence.fit(evidence.given)
     enough = fit.tested >= EXAMINATION.min_confirming
     fits = fit.support >= EXAMINATION.min_support and enough
-    if fit.tested and (found := find_intrinsics(evidence, fit, nearby=fits)):
-        finding = _focal_finding(images, fit, found)
-        return CheckUp("fit" if fits else "unclear", fit, findings=(finding,))
+    if fit.tested and (findings := _camera_findings(evidence, fit, fits=fits)):
+        return CheckUp("fit" if fits else "unclear", fit, findings=findings)
     if fits:
         return CheckUp("fit", fit)
     progress("check points", 0.3)
@@ -122,6 +127,24 @@ def _examine(scene: Scene, images: Sequence[Image], progress: Progress) -> Check
         return CheckUp("unclear", fit)
     progress("check points", 0.6)
     return _examine_frame(evidence, images, fit)
+
+
+def _camera_findings(evidence: Evidence, fit: Fit, *, fits: bool) -> tuple[Finding, ...]:
+    """Find lens distortion or focal lengths that fit the photographs better than the given."""
+    images, groups = evidence.images, camera_groups(evidence.images)
+    better: list[tuple[float, tuple[Finding, ...]]] = []
+    if distortion := find_distortion(evidence, fit, groups):
+        finding = distortion_finding(evidence.scene, images, groups, fit, distortion)
+        better.append((distortion.fit.support, (finding,)))
+    start, there = evidence.given, fit
+    if found := find_intrinsics(evidence, fit, nearby=fits):
+        start, there = found.hypothesis, found.fit
+        better.append((there.support, (_focal_finding(images, fit, found),)))
+    scaled = start.center_factor != 1.0 or (found and not max(groups))
+    if not scaled and (factors := find_focal_factors(evidence, there, start, groups)):
+        named = focal_factor_findings(images, groups, factors)
+        better.append((factors.after.support, named))
+    return max(better, key=lambda each: each[0])[1] if better else ()
 
 
 def _examine_frame(evidence: Evidence, images: Sequence[Image], fit: Fit) -> CheckUp:
