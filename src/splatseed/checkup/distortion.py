@@ -38,7 +38,8 @@ class _Settings:
     kept_support: float = 0.9
     """Share of the support that is kept: other points lie within the photographs then."""
     rounds: int = 3
-    """Estimates of a coefficient, each with the one before undone."""
+    converged: float = 0.1
+    """Estimates of a coefficient, each with the one before undone, until it changes by less."""
 
 
 DISTORTED = _Settings()
@@ -78,9 +79,9 @@ def find_distortion(evidence: Evidence, fit: Fit, groups: Sequence[int]) -> Foun
         lenses = [_with_radial(lens, radial[g]) for lens, g in zip(given, groups, strict=True)]
         found, after = _with_lenses(evidence, lenses, groups, before)
         change = after.radial
-        if not _clear(evidence.images, groups, after).any():
+        if np.all(np.abs(change[clear]) <= DISTORTED.converged * np.abs(radial[clear])):
             break
-    else:
+    if _clear(evidence.images, groups, after).any():
         return None
     return replace(found, radial=radial) if _fits(found, fit) else None
 

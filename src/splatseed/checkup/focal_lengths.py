@@ -97,6 +97,7 @@ def find_focal_factors(
         members = [i for i, each in enumerate(groups) if each == group]
         pairs = _own_pairs(evidence, members)
         factors[group] = search_factor(evidence, start, members, pairs) or 1.0
+    searched = any(factor != 1.0 for factor in factors.values())
     before = estimate_intrinsics_error(evidence, fit, start, groups)
     after, fitted = before, fit
     for _ in range(FOCAL.rounds):
@@ -110,10 +111,12 @@ def find_focal_factors(
         factors |= {group: factors[group] * each for group, each in corrections.items()}
     else:
         return None  # it does not converge: something else is wrong
-    nearer = after.miss <= FOCAL.max_miss * before.miss and fitted.support >= fit.support
-    if fitted is fit or not (nearer or is_better(fitted, fit)):
+    nearer = searched or after.miss <= FOCAL.max_miss * before.miss
+    if fitted is fit or fitted.support < fit.support or not nearer:
         return None
     factors = {group: each * start.focal_factor for group, each in factors.items()}
+    if start is not evidence.given:
+        fit = evidence.fit(evidence.given, compared=compared)
     return FoundFactors(factors, fit, fitted, before.miss, after.miss)
 
 
@@ -145,7 +148,13 @@ def search_factor(
 
     fits = {factor: fit(factor) for factor in SEARCH.all_factors}
     best = max(fits, key=lambda factor: fits[factor].score)
-    return best if is_better(fits[best], fit(1.0)) else None
+    if not is_better(fits[best], fit(1.0)):
+        return None
+    groups = [int(i in members) for i in range(len(evidence.images))]
+    hypothesis = replace(start, view_factors=dict.fromkeys(members, best))
+    error = estimate_intrinsics_error(evidence, fits[best], hypothesis, groups)
+    near = np.log(SEARCH.all_factors[1] / SEARCH.all_factors[0])  # the next factor's
+    return best * float(1 + np.clip(error.focal[1], -near, near))
 
 
 def _of_group(pair: PairFit, groups: Sequence[int], group: int) -> bool:

@@ -5,26 +5,28 @@ fraction of its points that photographs confirm, over the pairs in which it take
 wrong pose is about 0, whereas its right partners have other pairs. Where the share is at most
 ``max_share`` of the median, and that of every pair at most twice as much, the photograph is
 compared with more partners and with those before and after it by name; it is named if all of them
-say the same. Photographs that share too few points with others are not checked.
+say the same. If its points fit with another focal length, that is named instead. Photographs that
+share too few points with others are not checked.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from splatseed.checkup.consistency import Evidence, PairFit
 from splatseed.checkup.examination import comparable
+from splatseed.checkup.focal_lengths import WRONG_FOCAL_LENGTH, search_factor
 from splatseed.depth.stereo.maps import MIN_POINTS
 from splatseed.errors import SplatseedError
 from splatseed.findings import Finding
 from splatseed.progress import Progress, silent
 from splatseed.sampling import strided
 from splatseed.scene import Image, Scene
-from splatseed.text import agreeing, counted
+from splatseed.text import agreeing, counted, name_some
 
 WRONG_POSES = "wrong-poses"
 SAMPLE = 100
@@ -47,6 +49,9 @@ class _Settings:
     """Median share below which no photograph is checked."""
     max_share: float = 0.25
     """Share of a wrong pose, as a fraction of the median."""
+    searched: int = 8
+    partners: int = 4
+    """Photographs whose focal length may be wrong instead of the pose, and views to find it by."""
     max_wrong: float = 0.3
     """Fraction of the photographs above which they are not single ones: nothing is said."""
 
@@ -80,18 +85,41 @@ def find_wrong_poses(
     suspects = _wrong(fit.pairs)
     further = [(i, j) for i in suspects for j in _more_partners(evidence, i)]
     confirmed = _wrong([*fit.pairs, *evidence.fit(evidence.given, compared=further).pairs])
-    wrong = tuple(images[i].name for i in confirmed if i in suspects)
+    wrong = [i for i in confirmed if i in suspects]
     if not wrong or len(wrong) > SINGLE.max_wrong * len(images):
         return ()
-    more = len(wrong) - NAMED
-    names = ", ".join(wrong[:NAMED]) + (f" and {more:,} more" if more > 0 else "")
+    factors = {i: _focal_factor(evidence, i) for i in wrong[: SINGLE.searched]}
+    zoomed = {images[i].name: factor for i, factor in factors.items() if factor is not None}
+    turned = tuple(images[i].name for i in wrong if images[i].name not in zoomed)
+    findings = (_focal_finding(zoomed),) if zoomed else ()
+    return (*findings, _pose_finding(turned)) if turned else findings
+
+
+def _focal_factor(evidence: Evidence, i: int) -> float | None:
+    """The factor of a photograph's focal length with which its pose fits; None without any."""
+    near = evidence.candidates(i, evidence.given.poses)[: SINGLE.partners]
+    return search_factor(evidence, evidence.given, [i], [(i, j) for j in near])
+
+
+def _focal_finding(factors: Mapping[str, float]) -> Finding:
+    each = name_some([f"{name} ({factor:.3g} times)" for name, factor in factors.items()], NAMED)
+    text = (
+        f"Points that other photographs confirm fit {counted(len(factors), 'photograph')} with "
+        f"another focal length: {each}."
+    )
+    fix = "Correct it, or leave them out of seeds and training: `drop_wrong_poses=True`."
+    return Finding(WRONG_FOCAL_LENGTH, text, "error", tuple(factors), fix=fix)
+
+
+def _pose_finding(wrong: tuple[str, ...]) -> Finding:
     which = agreeing(len(wrong), "its pose is", "their poses are")
+    shows = agreeing(len(wrong), "it shows", "they show")
     text = (
         f"Points that other photographs confirm do not fit {counted(len(wrong), 'photograph')}: "
-        f"{names}; {which} wrong, or {agreeing(len(wrong), 'it shows', 'they show')} other things."
+        f"{name_some(wrong, NAMED)}; {which} wrong, or {shows} other things."
     )
     leave = "`drop_wrong_poses=True` leaves them out of seeds and training."
-    return (Finding(WRONG_POSES, text, "error", wrong, fix=leave),)
+    return Finding(WRONG_POSES, text, "error", wrong, fix=leave)
 
 
 def _more_partners(evidence: Evidence, i: int) -> list[int]:
@@ -142,6 +170,6 @@ def without_wrong_poses(
         return scene, ()
     images = tuple(image for image in scene.images if image.name not in wrong)
     left = scene.replace(images=images, absent=(*scene.absent, *sorted(wrong)))
-    text = f"{counted(len(wrong), 'photograph')} with wrong poses are left out: "
+    text = f"{counted(len(wrong), 'photograph')} that do not fit the points are left out: "
     text += f"{', '.join(sorted(wrong)[:NAMED])}{' ...' if len(wrong) > NAMED else ''}."
     return left, (Finding(WRONG_POSES, text, "info", tuple(sorted(wrong))),)

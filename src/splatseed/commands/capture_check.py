@@ -141,7 +141,7 @@ def check_capture(
         points = examine(scene, comparable(scene), progress)
     except SplatseedError as error:
         refused = error
-    if points is not None and points.confirms_poses:
+    if points is not None and points.confirms_poses and not points.findings:
         limit = None if all_photographs else SAMPLE
         single = find_wrong_poses(scene, comparable(scene), progress, limit)
     return CaptureCheck(points, _check_poses(scene, masked, refused, progress), single)
