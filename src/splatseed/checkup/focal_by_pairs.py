@@ -24,10 +24,12 @@ from splatseed.scene import Image, Scene
 class _Settings:
     """Which factors are tried, and when one is named."""
 
-    factors: tuple[float, ...] = tuple(np.geomspace(0.35, 2.85, 15).tolist())
+    factors: tuple[float, ...] = tuple(np.geomspace(0.35, 2.85, 11).tolist())
     fine_steps: tuple[float, ...] = (0.86, 0.93, 1.07, 1.15)
     max_error: float = 0.5
     """Error that may be left, as a share of that before."""
+    min_change: float = 0.05
+    """Difference of the factor from 1."""
     max_px: float = 2 * MAX_EXACT
     """Error that may be left, in pixels."""
 
@@ -48,7 +50,7 @@ def find_focal_length(
     """
     if error is not None and error.exact:
         return ()
-    tried = [(factor, 1.0) for factor in SEARCH.factors]
+    tried = [(factor, 1.0) for factor in (1.0, *SEARCH.factors)]
     if (center := centering_factor(images)) is not None:
         tried.append((center, center))
     errors = estimate_focal_errors(scene, images, tried, progress)
@@ -63,21 +65,21 @@ def find_focal_length(
         focal = _vertex([f for f, _ in known], [errors[factors] for factors in known])
         best = (focal, 1.0)
         errors |= estimate_focal_errors(scene, images, [best], silent)
-    limit = SEARCH.max_px if error is None else SEARCH.max_error * error.px
-    if errors.get(best, np.inf) > min(limit, SEARCH.max_px):
+    # Not ``error``, which may be that of other pairs.
+    before, after = errors.get((1.0, 1.0)), errors.get(best, np.inf)
+    limit = SEARCH.max_px if before is None else SEARCH.max_error * before
+    if after > min(limit, SEARCH.max_px) or abs(focal - 1) < SEARCH.min_change:
         return ()
-    before = "at too few places to tell" if error is None else f"by about {error}"
+    missed = "at too few places to tell" if before is None else f"by about {before:.2g} px"
     given = images[0].intrinsics
     what = "focal lengths" if center == 1.0 else "focal lengths and principal points"
     text = (
-        f"The {what} are not those of the photographs: photographs miss each other {before}, and by "
-        f"{errors[best]:.2g} px with {what} {focal:.3g} times as large."
+        f"The {what} are not those of the photographs: photographs miss each other {missed}, and "
+        f"by {after:.2g} px with {what} {focal:.3g} times as large."
     )
     others = "" if len({image.intrinsics.camera_id for image in images}) == 1 else " of the first"
-    fix = (
-        f"Set the focal length{others} to about {focal * given.K[0, 0]:.4g} px, for {given.width} x "
-        f"{given.height} pixels"
-    )
+    size = f"{given.width} x {given.height} pixels"
+    fix = f"Set the focal length{others} to about {focal * given.K[0, 0]:.4g} px, for {size}"
     if center != 1.0:
         fix += f", the principal point to {given.K[0, 2] * center:.5g}, "
         fix += f"{given.K[1, 2] * center:.5g}"

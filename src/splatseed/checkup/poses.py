@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.camera import Camera
+from splatseed.checkup.focal_by_pairs import find_focal_length
 from splatseed.checkup.pose_accuracy import estimate_pose_error
 from splatseed.depth.stereo.coarse import prior_from_baseline
 from splatseed.depth.stereo.maps import StereoResult, StereoSettings
@@ -144,6 +145,9 @@ def _disagreement(
             fix=f"Take more photographs in between, or estimate new poses: {sfm}.",
         )
     error = estimate_pose_error(scene, images)
+    # With points, focal lengths have been tried by them.
+    if not len(scene.points) and (other := find_focal_length(scene, images, error)):
+        return SceneFormatError(expected, found=other[0].text.rstrip("."), fix=other[0].fix)
     inexact = error is not None and not error.exact
     found = f"a depth that others confirm at {agreement:.1%} of their pixels"
     new_poses = f"or estimate new poses: {sfm}."

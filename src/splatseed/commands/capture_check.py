@@ -155,6 +155,7 @@ def _check_poses(
     ``refused`` is why the examination of points refuses the poses. Else a scene with points has no
     doubts: it can be trained from them.
     """
+    from splatseed.checkup.focal_by_pairs import find_focal_length
     from splatseed.checkup.pose_accuracy import INEXACT_POSES, estimate_pose_error, given_pose_error
     from splatseed.checkup.poses import (
         InexactPosesError,
@@ -177,5 +178,6 @@ def _check_poses(
     if has_points(scene):
         return PoseCheck(agreement, estimate_pose_error(scene, images, progress))
     pose_error = given_pose_error(scene, images, progress)
-    doubts = pose_error.findings if pose_error else ()
+    doubts = find_focal_length(scene, images, pose_error, progress)
+    doubts = doubts or (pose_error.findings if pose_error else ())
     return PoseCheck(agreement, pose_error, doubts, agreement_findings(agreement, masked))

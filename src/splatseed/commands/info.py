@@ -297,8 +297,9 @@ def _unit_mismatch(scene: Scene, poses: PoseCheck | None) -> tuple[Finding, ...]
     if ratio is None:
         return ()
     times = f"their depth is {ratio:.4g} times that of the photographs"
-    text = f"the depth maps are in another unit than the poses: {times}"
-    return (Finding(UNIT_MISMATCH, text, "error"),)
+    text = f"the depth maps are in another unit than the poses: {times}."
+    fix = "Method auto divides by it; other methods and trainers need the right unit."
+    return (Finding(UNIT_MISMATCH, text, "error", fix=fix),)
 
 
 def _next(
