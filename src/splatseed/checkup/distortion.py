@@ -96,7 +96,7 @@ def _clear(
         radius = np.hypot(lens.width / lens.K[0, 0], lens.height / lens.K[1, 1]) / 2
         motion[group] = abs(k) * radius**3 * lens.K[0, 0] / max(lens.width, lens.height)
     enough = np.abs(error.radial) >= DISTORTED.min_deviations * error.radial_sigma
-    return enough & (motion >= DISTORTED.min_motion)
+    return np.asarray(enough & (motion >= DISTORTED.min_motion))
 
 
 def _with_radial(lens: Intrinsics, k: float) -> Intrinsics:

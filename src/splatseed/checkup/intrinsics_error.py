@@ -76,8 +76,10 @@ def estimate_intrinsics_error(
     far = np.concatenate(reach)
     outer = far >= np.percentile(far, 75)
     miss = float(np.median(np.linalg.norm(m[outer], axis=1)))
-    parts = [solution[:count], solution[count : 2 * count], sigma[:count], sigma[count : 2 * count]]
-    return IntrinsicsError(*parts, miss)
+    of_focal, of_radial = slice(count), slice(count, 2 * count)
+    return IntrinsicsError(
+        solution[of_focal], solution[of_radial], sigma[of_focal], sigma[of_radial], miss
+    )
 
 
 def _motions(cameras: tuple[Camera, Camera], matches: Matches) -> tuple[list[list[Places]], Places]:

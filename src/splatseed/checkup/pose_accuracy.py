@@ -124,7 +124,7 @@ def estimate_focal_errors(
     Those with which too few corners are found again are left out.
     """
     pairs = list(_load_pairs(scene, images, silent))
-    errors = {}
+    errors: dict[tuple[float, float], float] = {}
     for number, factor in enumerate(factors):
         error = _of_pairs(images, [[_zoomed(view, *factor) for view in pair] for pair in pairs])
         errors |= {} if error is None else {factor: error.px}

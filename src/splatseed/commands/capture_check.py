@@ -73,8 +73,11 @@ class CaptureCheck:
     @property
     def first(self) -> str:
         """What must be mended first, as an imperative; empty if there is nothing."""
-        if any(each.kind == "wrong-focal-length" for each in self.findings):
+        kinds = {each.kind for each in self.findings}
+        if "wrong-focal-length" in kinds:
             return "correct the focal length first, as the line at the top says"
+        if "wrong-distortion" in kinds:
+            return "correct the lens distortion first, as the line at the top says"
         if self.poses is not None and self.poses.wrong:
             return "correct the poses first, as the line at the top says"
         return ""
