@@ -3,8 +3,9 @@
 Points that photographs support (``consistency``) confirm poses and intrinsics. Where they do not,
 what people's tools do to a capture is tried, in this order: lens distortion and focal lengths, of
 which small errors show even where points fit; poses of another convention, by comparing photographs
-without the points, which refuses the capture; points in other axes, or of another scale. Points count as *unfit* only if photographs agree at the poses
-and see surfaces elsewhere than the points; nothing is said of what cannot be decided (*unclear*).
+without the points, which refuses the capture; points in other axes, or of another scale. Points
+count as *unfit* only if photographs agree at the poses and see surfaces elsewhere than the points;
+nothing is said of what cannot be decided (*unclear*).
 """
 
 from __future__ import annotations

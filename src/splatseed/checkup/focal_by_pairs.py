@@ -26,6 +26,8 @@ class _Settings:
 
     factors: tuple[float, ...] = tuple(np.geomspace(0.35, 2.85, 11).tolist())
     fine_steps: tuple[float, ...] = (0.86, 0.93, 1.07, 1.15)
+    min_degrees: float = 0.1
+    """Error of poses from which on factors are tried; a phone's poses have 0.08."""
     max_error: float = 0.5
     """Error that may be left, as a share of that before."""
     min_change: float = 0.05
@@ -45,10 +47,10 @@ def find_focal_length(
 ) -> tuple[Finding, ...]:
     """Name the factor of all focal lengths with which photographs fit; nothing if there is none.
 
-    ``error`` is that of the poses as they are: if it is exact, nothing is tried. None: too few
+    ``error`` is that of the poses as they are: if it is small, nothing is tried. None: too few
     places were found again, as with focal lengths that are far off.
     """
-    if error is not None and error.exact:
+    if error is not None and (error.exact or error.degrees < SEARCH.min_degrees):
         return ()
     tried = [(factor, 1.0) for factor in (1.0, *SEARCH.factors)]
     if (center := centering_factor(images)) is not None:
