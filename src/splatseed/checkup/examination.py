@@ -45,6 +45,11 @@ class _Settings:
     """Support of points that are unfit; wrong ones reached 0.09."""
     max_unlike: float = 0.55
     """Colour error from which on points may be unfit."""
+    unrelated: float = 0.85
+    """Colour error of points whose colours say nothing of the photographs; right ones reached
+    0.58."""
+    max_unrelated: float = 0.3
+    """Support of unfit points of such colours: cameras close together confirm a part of any."""
     min_tested: int = 100
     """Minimum number of points compared, to report that photographs agree nowhere."""
     min_surface: int = 100
@@ -105,7 +110,9 @@ def _examine(scene: Scene, images: Sequence[Image], progress: Progress) -> Check
     evidence = Evidence(scene, images)
     fit = evidence.fit(evidence.given)
     enough = fit.tested >= EXAMINATION.min_confirming
-    fits = fit.support >= EXAMINATION.min_support and enough
+    unrelated = fit.color_error >= EXAMINATION.unrelated
+    needed = EXAMINATION.max_unrelated if unrelated else EXAMINATION.min_support
+    fits = fit.support >= needed and enough
     if fit.tested and (found := find_intrinsics(evidence, fit, nearby=fits)):
         finding = _focal_finding(images, fit, found)
         return CheckUp("fit" if fits else "unclear", fit, findings=(finding,))
@@ -118,7 +125,8 @@ def _examine(scene: Scene, images: Sequence[Image], progress: Progress) -> Check
         raise
     except SceneFormatError as refused:
         return CheckUp("unclear", fit, findings=_disagreement(fit, refused))
-    if fit.support > EXAMINATION.max_unfit or fit.color_error < EXAMINATION.max_color_error:
+    most = EXAMINATION.max_unrelated if unrelated else EXAMINATION.max_unfit
+    if fit.support > most or fit.color_error < EXAMINATION.max_color_error:
         return CheckUp("unclear", fit)
     progress("check points", 0.6)
     return _examine_frame(evidence, images, fit)
@@ -140,8 +148,9 @@ def _examine_frame(evidence: Evidence, images: Sequence[Image], fit: Fit) -> Che
     ):
         return CheckUp("unclear", fit)
     text = (
-        f"Photographs confirm {fit.confirmed:.0%} of the points where they are, no more than by "
-        "chance, and see surfaces elsewhere: the points are random, or of another scene or frame."
+        f"Photographs confirm {fit.confirmed:.0%} of the points where they are, {fit.chance:.0%} "
+        "by chance, and see surfaces elsewhere: the points are random, or of another scene or "
+        "frame."
     )
     return CheckUp("unfit", fit, findings=(_unfit_finding(text),))
 

@@ -115,7 +115,7 @@ def estimate_pose_error(
     errors, pairs = [], 0
     for number, i in enumerate(chosen):
         compared = [images[i], *(images[j] for j in partners[i].tolist() if j >= 0)]
-        view, *others = load_views(scene, compared, data_factor=factor, undistort=True)
+        view, *others = load_views(scene, compared, data_factor=factor, undistort=True, draft=True)
         pairs += len(others)
         for other in others:
             misses = np.abs(_misses(view, other))

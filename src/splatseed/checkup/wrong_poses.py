@@ -43,7 +43,7 @@ class _Settings:
     """With fewer photographs none is checked."""
     min_tested: int = 16
     """Points that a photograph must share with others to be checked."""
-    min_median: float = 0.25
+    min_median: float = 0.2
     """Median share below which no photograph is checked."""
     max_share: float = 0.25
     """Share of a wrong pose, as a fraction of the median."""
