@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -177,10 +178,11 @@ class Evidence:
             compared = self._pairs(hypothesis.poses, photographs)
         pairs, errors, unrelated = list[PairFit](), list[np.ndarray](), list[np.ndarray]()
         self._load({i for pair in compared for i in pair}, progress)
+        seen_by = cache(lambda i: self._seen_by(i, hypothesis))
         for number, (i, j) in enumerate(compared):
             progress("compare photographs with points", number / len(compared))
             cameras = [self._camera(k, hypothesis) for k in (i, j)]
-            rows = self._common(i, j, cameras, hypothesis.xyz)
+            rows = _in_both(seen_by(i), seen_by(j))
             sample = strided(rows, points)
             if len(sample) < CONSISTENCY.min_points:
                 continue
@@ -262,17 +264,11 @@ class Evidence:
         K[:2, 2] *= hypothesis.center_factor
         return Camera(K, view.width, view.height, hypothesis.poses[i])
 
-    def _common(
-        self, i: int, j: int, cameras: Sequence[Camera], xyz: Float64[np.ndarray, "P 3"]
-    ) -> Int64[np.ndarray, " M"]:
-        """Points that both views see: by tracks if there are any, else by a coarse z-buffer."""
+    def _seen_by(self, i: int, hypothesis: Hypothesis) -> Int64[np.ndarray, " M"]:
+        """Points that a view sees: by tracks if there are any, else by a coarse z-buffer."""
         if self._seen.count:
-            first, second = (self._seen.rows_of(self.images[k]) for k in (i, j))
-        else:
-            first, second = (_nearest_points(camera, xyz) for camera in cameras)
-        both = np.zeros((2, len(xyz)), bool)
-        both[0, first] = both[1, second] = True
-        return np.flatnonzero(both.all(axis=0))
+            return self._seen.rows_of(self.images[i])
+        return _nearest_points(self._camera(i, hypothesis), hypothesis.xyz)
 
     def _fit_pair(
         self, i: int, j: int, cameras: Sequence[Camera], xyz: Float64[np.ndarray, "M 3"]
@@ -290,6 +286,15 @@ class Evidence:
             chance, tested = _confirm(grey, other, cameras, away)
             by_chance, moved = by_chance + chance, moved + tested
         return PairFit(i, j, confirmed, textured + outside, by_chance, moved)
+
+
+def _in_both(
+    first: Int64[np.ndarray, " M"], second: Int64[np.ndarray, " N"]
+) -> Int64[np.ndarray, " K"]:
+    """The rows that both have, rising; one may have a row twice."""
+    both = np.zeros((2, 1 + max(first.max(initial=0), second.max(initial=0))), bool)
+    both[0, first] = both[1, second] = True
+    return np.flatnonzero(both.all(axis=0))
 
 
 def _nearest_points(camera: Camera, xyz: Float64[np.ndarray, "P 3"]) -> Int64[np.ndarray, " M"]:

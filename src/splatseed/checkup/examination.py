@@ -81,13 +81,19 @@ class CheckUp:
 UNCLEAR = CheckUp("unclear")
 
 
-def examine(scene: Scene, images: Sequence[Image], progress: Progress = silent) -> CheckUp:
+def examine(
+    scene: Scene,
+    images: Sequence[Image],
+    progress: Progress = silent,
+    evidence: Evidence | None = None,
+) -> CheckUp:
     """Hold the points of a scene against photographs and poses.
 
     Args:
         scene: A scene; without points or photographs, nothing is found.
         images: Those of its images that may be compared.
         progress: Called with the stage and the fraction done.
+        evidence: That of these images, which keeps the photographs that it has read.
 
     Raises:
         SceneFormatError: The poses are of another convention: the same error as without points.
@@ -96,7 +102,7 @@ def examine(scene: Scene, images: Sequence[Image], progress: Progress = silent) 
     if len(images) < 2 or np.count_nonzero(originals.distinct) < MIN_POINTS:
         return UNCLEAR
     try:
-        return _examine(scene, images, progress)
+        return _examine(scene, images, progress, evidence or Evidence(scene, images))
     except WrongConventionError:
         raise
     except SplatseedError:  # photographs that cannot be used, which the reader of them reports
@@ -105,9 +111,10 @@ def examine(scene: Scene, images: Sequence[Image], progress: Progress = silent) 
         progress("check points", 1.0)
 
 
-def _examine(scene: Scene, images: Sequence[Image], progress: Progress) -> CheckUp:
+def _examine(
+    scene: Scene, images: Sequence[Image], progress: Progress, evidence: Evidence
+) -> CheckUp:
     progress("check points", 0.0)
-    evidence = Evidence(scene, images)
     fit = evidence.fit(evidence.given)
     enough = fit.tested >= EXAMINATION.min_confirming
     unrelated = fit.color_error >= EXAMINATION.unrelated
