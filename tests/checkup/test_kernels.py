@@ -17,8 +17,8 @@ def test_the_place_is_that_of_the_moved_photograph(rng, right, down):
     # The identity carries every pixel over to itself.
     places = find_points(first, second, uv, np.ones(20), np.eye(3), np.zeros(3), 3, 4, 0.1)
     np.testing.assert_allclose(places[:, :2], np.tile([right, down], (20, 1)), atol=0.5)
-    np.testing.assert_allclose(np.median(places[:, :2], axis=0), [right, down], atol=0.12)
-    assert (places[:, 2] > 0.95).all()
+    np.testing.assert_allclose(np.median(places[:, :2], axis=0), [right, down], atol=0.15)
+    assert (places[:, 2] > 0.9).all()
 
 
 def test_the_plane_of_a_point_moves_with_its_depth(rng):
@@ -27,8 +27,8 @@ def test_the_plane_of_a_point_moves_with_its_depth(rng):
     second = shift(first, (0, 6), order=3, mode="nearest")
     uv, t = np.array([[40.0, 30.0], [40.0, 30.0]]), np.array([12.0, 0, 0])
     places = find_points(first, second, uv, np.array([2.0, 1.5]), np.eye(3), t, 3, 4, 0.1)
-    np.testing.assert_allclose(places[0, :2], [0, 0], atol=0.1)
-    np.testing.assert_allclose(places[1, :2], [-2, 0], atol=0.1)
+    np.testing.assert_allclose(places[0, :2], [0, 0], atol=0.3)
+    np.testing.assert_allclose(places[1, :2], [-2, 0], atol=0.3)
 
 
 def test_bare_patches_and_those_at_the_border_are_not_searched_for(rng):
