@@ -52,6 +52,11 @@ class _Settings:
     """Support of points that are unfit; wrong ones reached 0.09."""
     max_unlike: float = 0.55
     """Colour error from which on points may be unfit."""
+    unrelated: float = 0.85
+    """Colour error of points whose colours say nothing of the photographs; right ones reached
+    0.58."""
+    max_unrelated: float = 0.3
+    """Support of unfit points of such colours: cameras close together confirm a part of any."""
     min_tested: int = 100
     """Minimum number of points compared, to report that photographs agree nowhere."""
     min_surface: int = 100
@@ -83,13 +88,19 @@ class CheckUp:
 UNCLEAR = CheckUp("unclear")
 
 
-def examine(scene: Scene, images: Sequence[Image], progress: Progress = silent) -> CheckUp:
+def examine(
+    scene: Scene,
+    images: Sequence[Image],
+    progress: Progress = silent,
+    evidence: Evidence | None = None,
+) -> CheckUp:
     """Hold the points of a scene against photographs and poses.
 
     Args:
         scene: A scene; without points or photographs, nothing is found.
         images: Those of its images that may be compared.
         progress: Called with the stage and the fraction done.
+        evidence: That of these images, which keeps the photographs that it has read.
 
     Raises:
         SceneFormatError: The poses are of another convention: the same error as without points.
@@ -98,7 +109,7 @@ def examine(scene: Scene, images: Sequence[Image], progress: Progress = silent) 
     if len(images) < 2 or np.count_nonzero(originals.distinct) < MIN_POINTS:
         return UNCLEAR
     try:
-        return _examine(scene, images, progress)
+        return _examine(scene, images, progress, evidence or Evidence(scene, images))
     except WrongConventionError:
         raise
     except SplatseedError:  # photographs that cannot be used, which the reader of them reports
@@ -107,12 +118,15 @@ def examine(scene: Scene, images: Sequence[Image], progress: Progress = silent) 
         progress("check points", 1.0)
 
 
-def _examine(scene: Scene, images: Sequence[Image], progress: Progress) -> CheckUp:
+def _examine(
+    scene: Scene, images: Sequence[Image], progress: Progress, evidence: Evidence
+) -> CheckUp:
     progress("check points", 0.0)
-    evidence = Evidence(scene, images)
     fit = evidence.fit(evidence.given)
     enough = fit.tested >= EXAMINATION.min_confirming
-    fits = fit.support >= EXAMINATION.min_support and enough
+    unrelated = fit.color_error >= EXAMINATION.unrelated
+    needed = EXAMINATION.max_unrelated if unrelated else EXAMINATION.min_support
+    fits = fit.support >= needed and enough
     if fit.tested and (findings := _camera_findings(evidence, fit, fits=fits)):
         return CheckUp("fit" if fits else "unclear", fit, findings=findings)
     if fits:
@@ -124,7 +138,8 @@ def _examine(scene: Scene, images: Sequence[Image], progress: Progress) -> Check
         raise
     except SceneFormatError as refused:
         return CheckUp("unclear", fit, findings=_disagreement(fit, refused))
-    if fit.support > EXAMINATION.max_unfit or fit.color_error < EXAMINATION.max_color_error:
+    most = EXAMINATION.max_unrelated if unrelated else EXAMINATION.max_unfit
+    if fit.support > most or fit.color_error < EXAMINATION.max_color_error:
         return CheckUp("unclear", fit)
     progress("check points", 0.6)
     return _examine_frame(evidence, images, fit)
@@ -164,8 +179,9 @@ def _examine_frame(evidence: Evidence, images: Sequence[Image], fit: Fit) -> Che
     ):
         return CheckUp("unclear", fit)
     text = (
-        f"Photographs confirm {fit.confirmed:.0%} of the points where they are, no more than by "
-        "chance, and see surfaces elsewhere: the points are random, or of another scene or frame."
+        f"Photographs confirm {fit.confirmed:.0%} of the points where they are, {fit.chance:.0%} "
+        "by chance, and see surfaces elsewhere: the points are random, or of another scene or "
+        "frame."
     )
     return CheckUp("unfit", fit, findings=(_unfit_finding(text),))
 

@@ -99,7 +99,9 @@ def find_intrinsics(evidence: Evidence, fit: Fit, *, nearby: bool) -> Found | No
         tried.append(replace(given, focal_factor=center, center_factor=center))
     base = _quick(evidence, given)
     best = _best(evidence, tried)
-    if best is None or not is_better(best.fit, base):
+    # Between two factors of a search few points may fit; all are compared below.
+    near = not nearby and best is not None and best.fit.support >= SEARCH.min_support / 2
+    if best is None or not (near or is_better(best.fit, base)):
         return None
     hypothesis = best.hypothesis
     if hypothesis.center_factor == 1.0:  # else the factor is exact

@@ -149,7 +149,7 @@ def _load_pairs(
     chosen = evenly_spaced(len(images), POSE_ACCURACY.photographs).tolist()
     for number, i in enumerate(chosen):
         compared = [images[i], *(images[j] for j in partners[i].tolist() if j >= 0)]
-        yield load_views(scene, compared, data_factor=factor, undistort=True)
+        yield load_views(scene, compared, data_factor=factor, undistort=True, draft=True)
         progress("measure poses", (number + 1) / len(chosen))
 
 

@@ -239,7 +239,7 @@ def compare_sample(
     idx = [first, *partners[partners >= 0].tolist()]
     chosen = [images[i] for i in idx]
     factor = factor_for_size(chosen, POSE_CHECK.side)
-    loaded = load_views(scene, chosen, data_factor=factor, undistort=True)
+    loaded = load_views(scene, chosen, data_factor=factor, undistort=True, draft=True)
     views = [view.posed(poses[i]) for view, i in zip(loaded, idx, strict=True)]
     sources = choose_by_pose(poses[idx], POSE_CHECK.partners)
     priors = [prior_from_baseline(views, i, others) for i, others in enumerate(sources)]

@@ -29,7 +29,7 @@ from splatseed.scene import Image, Scene
 from splatseed.text import agreeing, counted, name_some
 
 WRONG_POSES = "wrong-poses"
-SAMPLE = 100
+SAMPLE = 150
 """Photographs that ``splatseed info`` compares unless it is to compare all."""
 NAMED = 8
 """Photographs named in the text; all are subjects of the finding."""
@@ -45,7 +45,7 @@ class _Settings:
     """With fewer photographs none is checked."""
     min_tested: int = 16
     """Points that a photograph must share with others to be checked."""
-    min_median: float = 0.25
+    min_median: float = 0.2
     """Median share below which no photograph is checked."""
     max_share: float = 0.25
     """Share of a wrong pose, as a fraction of the median."""
@@ -60,7 +60,11 @@ SINGLE = _Settings()
 
 
 def find_wrong_poses(
-    scene: Scene, images: Sequence[Image], progress: Progress = silent, limit: int | None = None
+    scene: Scene,
+    images: Sequence[Image],
+    progress: Progress = silent,
+    limit: int | None = None,
+    evidence: Evidence | None = None,
 ) -> tuple[Finding, ...]:
     """Name photographs whose poses do not fit the points that others see; nothing without points.
 
@@ -69,22 +73,26 @@ def find_wrong_poses(
         images: Its images to compare.
         progress: Called with the stage and the fraction done.
         limit: The maximum number of photographs to compare, spread evenly; None: all.
+        evidence: That of the images, which keeps the photographs that it has read.
     """
     points = scene.points.originals
-    images = images if limit is None else strided(images, limit)
+    if limit is not None and len(images) > limit:
+        images, evidence = strided(images, limit), None
     too_few = len(images) < SINGLE.min_photographs
     if too_few or np.count_nonzero(points.distinct) < MIN_POINTS:
         return ()
-    evidence = Evidence(scene, images)
+    evidence = evidence or Evidence(scene, images)
     try:
         fit = evidence.fit(
             evidence.given, points=SINGLE.points, photographs=len(images), progress=progress
         )
     except SplatseedError:  # photographs that cannot be used, which the reader of them reports
         return ()
-    suspects = _wrong(fit.pairs)
+    max_share = SINGLE.max_share * _median_share(fit.pairs)
+    suspects = _wrong(fit.pairs, max_share)
     further = [(i, j) for i in suspects for j in _more_partners(evidence, i)]
-    confirmed = _wrong([*fit.pairs, *evidence.fit(evidence.given, compared=further).pairs])
+    more_pairs = evidence.fit(evidence.given, compared=further).pairs
+    confirmed = _wrong([*fit.pairs, *more_pairs], max_share)
     wrong = [i for i in confirmed if i in suspects]
     if not wrong or len(wrong) > SINGLE.max_wrong * len(images):
         return ()
@@ -128,23 +136,30 @@ def _more_partners(evidence: Evidence, i: int) -> list[int]:
     return sorted({*near, *beside})
 
 
-def _wrong(pairs: Sequence[PairFit]) -> list[int]:
-    """Return the indices of the views whose pairs all fail."""
+def _pairs_of_views(pairs: Sequence[PairFit]) -> dict[int, list[PairFit]]:
+    """The pairs of each view that shares enough points with others."""
     of_view: dict[int, list[PairFit]] = defaultdict(list)
     for pair in pairs:
         of_view[pair.first].append(pair)
         of_view[pair.second].append(pair)
-    shares = {i: _share(each) for i, each in of_view.items() if _tested(each) >= SINGLE.min_tested}
-    if not shares:
-        return []
-    median = float(np.median(list(shares.values())))
-    if median < SINGLE.min_median:
-        return []
-    limit = SINGLE.max_share * median
+    return {i: each for i, each in of_view.items() if _tested(each) >= SINGLE.min_tested}
+
+
+def _median_share(pairs: Sequence[PairFit]) -> float:
+    """The median view's share; 0, at which none is wrong, where it is too low."""
+    median = float(np.median([*map(_share, _pairs_of_views(pairs).values())] or [0.0]))
+    return median if median >= SINGLE.min_median else 0.0
+
+
+def _wrong(pairs: Sequence[PairFit], limit: float) -> list[int]:
+    """Return the indices of the views whose pairs all fail: their share is at most ``limit``."""
     return sorted(
         i
-        for i, share in shares.items()
-        if share <= limit and len(of_view[i]) > 1 and max(map(_pair_share, of_view[i])) <= 2 * limit
+        for i, each in _pairs_of_views(pairs).items()
+        if limit > 0
+        and len(each) > 1
+        and _share(each) <= limit
+        and max(map(_pair_share, each)) <= 2 * limit
     )
 
 

@@ -136,17 +136,20 @@ def check_capture(
     """
     if not scene.has_photographs:
         return CaptureCheck(None, None, ())
+    from splatseed.checkup.consistency import Evidence
     from splatseed.checkup.examination import comparable, examine
     from splatseed.checkup.wrong_poses import SAMPLE, find_wrong_poses
 
     points, refused, single = None, None, tuple[Finding, ...]()
+    images = comparable(scene)
+    evidence = Evidence(scene, images) if len(images) > 1 else None
     try:
-        points = examine(scene, comparable(scene), progress)
+        points = examine(scene, images, progress, evidence)
     except SplatseedError as error:
         refused = error
     if points is not None and points.confirms_poses and not points.findings:
         limit = None if all_photographs else SAMPLE
-        single = find_wrong_poses(scene, comparable(scene), progress, limit)
+        single = find_wrong_poses(scene, images, progress, limit, evidence)
     return CaptureCheck(points, _check_poses(scene, masked, refused, progress), single)
 
 

@@ -83,7 +83,7 @@ class Options:
     trainer: Annotated[TrainerName, tyro.conf.arg(name="for")] = "splatseed"
     """The trainer that you plan to use: the advice and the commands are for it."""
     all_photographs: bool = False
-    """Compare all photographs with the points, not 100 at most, to find single wrong poses."""
+    """Compare all photographs with the points, not 150 at most, to find single wrong poses."""
     json: bool = False
     """Print one JSON object instead, for scripts."""
 
