@@ -9,11 +9,12 @@ import pytest
 
 import splatseed as ss
 from splatseed.camera import Intrinsics
+from splatseed.depth.kinds import UNIT_MISMATCH
 from splatseed.depthmap import DepthMap, HeldDepths
 from splatseed.methods import SOURCE_CODES
 from splatseed.photos.view import view_of
 from splatseed.pointcloud import PointCloud
-from splatseed.seeding.map_seeds import UNIT_MISMATCH, depth_at_cells, unit_ratio
+from splatseed.seeding.map_seeds import depth_at_cells, unit_ratio
 
 pytestmark = pytest.mark.usefixtures("compare_once")
 DEPTH, COVER = SOURCE_CODES["depth"], SOURCE_CODES["cover"]

@@ -291,7 +291,8 @@ def _unit_mismatch(scene: Scene, poses: PoseCheck | None) -> tuple[Finding, ...]
     """Report depth maps of another unit than the poses, unless the poses cannot be checked."""
     if not in_scene_units(scene.depths) or poses is None or not poses.agreement:
         return ()
-    from splatseed.seeding.map_seeds import UNIT_MISMATCH, unit_ratio
+    from splatseed.depth.kinds import UNIT_MISMATCH
+    from splatseed.seeding.map_seeds import unit_ratio
 
     ratio = unit_ratio(scene, photographed(scene))
     if ratio is None:

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from splatseed.checkup.poses import compare_samples
 from splatseed.depth._kernels import find_edges
 from splatseed.depth.alignment import LIMITS, map_camera
+from splatseed.depth.kinds import UNIT_MISMATCH
 from splatseed.depth.settings import DepthSettings
 from splatseed.depth.stereo.maps import StereoResult
 from splatseed.depthmap import MIN_CONFIDENCE, DepthMap, DepthMaps
@@ -46,8 +47,6 @@ class _MapSettings:
 
 
 MAPS = _MapSettings()
-UNIT_MISMATCH = "depth-unit-mismatch"
-"""Kind of the finding that depth maps have another unit than the poses."""
 
 
 def seeds_from_maps(

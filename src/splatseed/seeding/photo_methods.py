@@ -138,7 +138,8 @@ class Stereo(PhotographMethod):
             return scene, ()
         if not self.depth_maps:
             return scene.replace(depths=None), ()
-        from splatseed.seeding.map_seeds import UNIT_MISMATCH, unit_ratio
+        from splatseed.depth.kinds import UNIT_MISMATCH
+        from splatseed.seeding.map_seeds import unit_ratio
 
         ratio = unit_ratio(scene, images)
         if ratio is None:
