@@ -54,7 +54,8 @@ class FoundDistortion:
     radial: Float64[np.ndarray, " C"] | None
     """k1 of each group of cameras, beyond what the record has; None: records without theirs."""
     fit: Fit
-    before: float  # px that points far from the centre miss their places by
+    plain: tuple[Fit, Fit]  # before and after, of points chosen without regard to their colours
+    before: float  # px that such points miss their places by, far from the centre
     after: float  # with these cameras
 
 
@@ -67,9 +68,15 @@ def find_distortion(evidence: Evidence, fit: Fit, groups: Sequence[int]) -> Foun
     before = estimate_intrinsics_error(evidence, fit, evidence.given, groups)
     clear = _clear(evidence.images, groups, before)
     distorted = any(lens.has_distortion for lens in given)
-    if distorted and (clear.any() or fit.support < DISTORTED.min_support):
-        found, after = _with_lenses(evidence, [lens.pinhole for lens in given], groups, before)
-        if _fits(found, fit) and not _clear(evidence.images, groups, after).any():
+    if not clear.any() and not (distorted and fit.support < DISTORTED.min_support):
+        return None
+    # Far from the centre, where distortion moves points most, their colours do not fit.
+    plain = _plain(evidence)
+    before = estimate_intrinsics_error(evidence, plain, evidence.given, groups)
+    if distorted:
+        lenses = [lens.pinhole for lens in given]
+        found, after = _with_lenses(evidence, lenses, groups, plain, before)
+        if _fits(found) and not _clear(evidence.images, groups, after).any():
             return found
     if not clear.any() or not all(lens.is_pinhole or lens.model in _RADIAL for lens in given):
         return None
@@ -77,13 +84,22 @@ def find_distortion(evidence: Evidence, fit: Fit, groups: Sequence[int]) -> Foun
     for _ in range(DISTORTED.rounds):
         radial = radial + np.where(clear, change, 0.0)
         lenses = [_with_radial(lens, radial[g]) for lens, g in zip(given, groups, strict=True)]
-        found, after = _with_lenses(evidence, lenses, groups, before)
+        found, after = _with_lenses(evidence, lenses, groups, plain, before)
         change = after.radial
         if np.all(np.abs(change[clear]) <= DISTORTED.converged * np.abs(radial[clear])):
             break
     if _clear(evidence.images, groups, after).any():
         return None
-    return replace(found, radial=radial) if _fits(found, fit) else None
+    return replace(found, radial=radial) if _fits(found) else None
+
+
+def _plain(evidence: Evidence) -> Fit:
+    """How points fit that are not chosen by their colours."""
+    colored, evidence.has_colors = evidence.has_colors, False
+    try:
+        return evidence.fit(evidence.given)
+    finally:
+        evidence.has_colors = colored
 
 
 def _clear(
@@ -110,28 +126,34 @@ def _with_radial(lens: Intrinsics, k: float) -> Intrinsics:
 
 
 def _with_lenses(
-    evidence: Evidence, lenses: Sequence[Intrinsics], groups: Sequence[int], before: IntrinsicsError
+    evidence: Evidence,
+    lenses: Sequence[Intrinsics],
+    groups: Sequence[int],
+    plain: Fit,
+    before: IntrinsicsError,
 ) -> tuple[FoundDistortion, IntrinsicsError]:
     """Measure the capture with other cameras."""
     pairs = zip(evidence.images, lenses, strict=True)
     images = [replace(image, intrinsics=lens) for image, lens in pairs]
     other = Evidence(evidence.scene, images)
+    without = _plain(other)
+    after = estimate_intrinsics_error(other, without, other.given, groups)
     fit = other.fit(other.given)
-    after = estimate_intrinsics_error(other, fit, other.given, groups)
-    return FoundDistortion(None, fit, before.miss, after.miss), after
+    return FoundDistortion(None, fit, (plain, without), before.miss, after.miss), after
 
 
-def _fits(found: FoundDistortion, fit: Fit) -> bool:
-    support = max(DISTORTED.min_support, DISTORTED.kept_support * fit.support)
+def _fits(found: FoundDistortion) -> bool:
+    before, after = (fit.support for fit in found.plain)
     nearer = found.after <= DISTORTED.max_miss * found.before or np.isnan(found.before)
-    return found.fit.support >= support and bool(nearer)
+    kept = after >= DISTORTED.kept_support * before
+    return bool(found.fit.support >= DISTORTED.min_support and kept and nearer)
 
 
 def distortion_finding(
-    scene: Scene, images: Sequence[Image], groups: Sequence[int], fit: Fit, found: FoundDistortion
+    scene: Scene, images: Sequence[Image], groups: Sequence[int], found: FoundDistortion
 ) -> Finding:
     """Name distortion, with the numbers before and after, and say what mends it."""
-    shares = f"{fit.confirmed:.0%} of the points, and {found.fit.confirmed:.0%}"
+    shares = "{:.0%} of the points, and {:.0%}".format(*(fit.confirmed for fit in found.plain))
     misses = f"those far from the centre are off by {found.before:.2g} px, and {found.after:.2g} px"
     if found.radial is None:
         text = (

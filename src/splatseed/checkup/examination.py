@@ -150,7 +150,7 @@ def _camera_findings(evidence: Evidence, fit: Fit, *, fits: bool) -> tuple[Findi
     images, groups = evidence.images, camera_groups(evidence.images)
     better: list[tuple[float, tuple[Finding, ...]]] = []
     if distortion := find_distortion(evidence, fit, groups):
-        finding = distortion_finding(evidence.scene, images, groups, fit, distortion)
+        finding = distortion_finding(evidence.scene, images, groups, distortion)
         better.append((distortion.fit.support, (finding,)))
     start, there = evidence.given, fit
     if found := find_intrinsics(evidence, fit, nearby=fits):
