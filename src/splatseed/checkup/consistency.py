@@ -57,6 +57,8 @@ class _Settings:
     """Maximum number of points without tracks."""
     hidden: int = 6
     """Points without tracks per point compared: the most alike in colour are."""
+    parts: int = 4
+    """Rows and columns of parts of an image, each of which keeps its share of these."""
     min_points: int = 8
     """Minimum number of common points of a pair."""
     half_patch: int = 3
@@ -228,14 +230,23 @@ class Evidence:
     ) -> Int64[np.ndarray, " N"]:  # fmt: skip
         """Of a larger sample, the points whose colours are most like those of both photographs.
 
-        The coarse z-buffer lets hidden points through, above all foliage's.
+        The coarse z-buffer lets hidden points through, above all foliage's. Each part of the image
+        keeps its share, as distortion and wrong focal lengths show at the borders.
         """
         rows = strided(rows, CONSISTENCY.hidden * points)
         beneath = [
             self._beneath(k, camera, xyz[rows]) for k, camera in zip(pair, cameras, strict=True)
         ]
         errors = np.abs(np.array(beneath) - self.rgb[rows]).mean(axis=2).max(axis=0)
-        return np.sort(rows[np.argsort(errors, kind="stable")[:points]])  # NaN last
+        uv = np.stack(project(cameras[0].pixels_from_world, xyz[rows])[:2], axis=1)
+        size = np.array([cameras[0].width, cameras[0].height])
+        parts = (uv / size * CONSISTENCY.parts).astype(np.int64) @ [CONSISTENCY.parts, 1]
+        order = np.lexsort((errors, parts))  # NaN last
+        _, start, count = np.unique(parts[order], return_index=True, return_counts=True)
+        rank = np.arange(len(rows)) - np.repeat(start, count)
+        kept = rank * len(rows) < points * np.repeat(count, count)
+        alike = np.sort(rows[order[kept]])
+        return np.asarray(alike[evenly_spaced(len(alike), points)])
 
     def _color_error(self, errors: Sequence[np.ndarray], unrelated: Sequence[np.ndarray]) -> float:
         if not sum(map(len, errors)):
