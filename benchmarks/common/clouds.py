@@ -18,7 +18,15 @@ from splatseed.errors import SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.synthetic.surfaces import Box, Cylinder, Rectangle, Sphere, Surface, Union, yaw_frame
 
-__all__ = ["REAL_SCENES", "find_scenes", "load_cloud", "room", "room_surfaces", "sample_unevenly"]
+__all__ = [
+    "REAL_SCENES",
+    "find_cases",
+    "find_scenes",
+    "load_cloud",
+    "room",
+    "room_surfaces",
+    "sample_unevenly",
+]
 
 REAL_SCENES = {
     "bonsai": "bonsai",
@@ -91,13 +99,26 @@ def find_scenes() -> Path:
     Raises:
         SceneNotFoundError: There is none on this machine.
     """
-    beside = Path(__file__).parents[3] / "shared" / "scenes"
-    folder = Path(os.environ.get("SPLATSEED_SCENES", beside))
+    return _find("SPLATSEED_SCENES", "scenes", "real captures", ", or use the made room")
+
+
+def find_cases() -> Path:
+    """The folder of builders of inputs: ``SPLATSEED_CASES``, or beside the captures.
+
+    Raises:
+        SceneNotFoundError: There is none on this machine.
+    """
+    return _find("SPLATSEED_CASES", "cases", "builders of inputs")
+
+
+def _find(variable: str, name: str, what: str, instead: str = "") -> Path:
+    beside = Path(__file__).parents[3] / "shared" / name
+    folder = Path(os.environ.get(variable, beside))
     if not folder.is_dir():
         raise SceneNotFoundError(
-            "the folder of real captures",
+            f"the folder of {what}",
             found="none on this machine",
-            fix="Set SPLATSEED_SCENES to it, or use the made room.",
+            fix=f"Set {variable} to it{instead}.",
         )
     return folder
 

@@ -68,6 +68,17 @@ def test_colours_are_not_needed(room):
     assert np.isnan(checkup.fit.color_error)
 
 
+def test_hidden_points_without_tracks_are_passed_over(room, rng):
+    """Colours tell them apart from visible ones, where a coarse z-buffer does not."""
+    behind = 1.6 * (room.points.xyz - room.images[0].camera.center) + room.images[0].camera.center
+    hidden = PointCloud(behind.astype(np.float32), rng.permutation(room.points.rgb))
+    alone = examine(room.replace(tracks=None), comparable(room)).fit
+    both = room.with_points(PointCloud.concatenate(room.points, hidden)).replace(tracks=None)
+    mixed = examine(both, comparable(both))
+    assert mixed.confirms_poses
+    assert mixed.fit.support > 0.8 * alone.support
+
+
 def test_the_same_is_found_in_any_unit(room):
     images = tuple(replace(each, translation=1000 * each.translation) for each in room.images)
     scene = _with_positions(room, 1000.0 * room.points.xyz).replace(images=images)

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from splatseed.camera import quat_from_rotation
 from splatseed.checkup import pose_accuracy as module
+from splatseed.checkup.focal_by_pairs import find_focal_length
 from splatseed.checkup.pose_accuracy import estimate_pose_error
 from splatseed.checkup.poses import check_poses
 from splatseed.pointcloud import PointCloud
@@ -88,3 +89,31 @@ def test_photographs_smaller_than_their_cameras_are_measured_at_their_size(room,
     assert error == estimate_pose_error(scene, scene.images)
     assert error.exact
     assert error.side == 160
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.6])
+def test_focal_lengths_of_another_size_are_found_without_points(room, poses, factor):
+    bare = _posed(room, poses)
+    assert not find_focal_length(bare, bare.images, estimate_pose_error(bare, bare.images))
+
+    def scaled(lens):
+        fx, fy, cx, cy = lens.params
+        return replace(lens, params=(factor * fx, factor * fy, cx, cy))
+
+    images = tuple(replace(im, intrinsics=scaled(im.intrinsics)) for im in bare.images)
+    scene = bare.replace(images=images)
+    (finding,) = find_focal_length(scene, images, estimate_pose_error(scene, images))
+    assert (finding.kind, finding.severity) == ("wrong-focal-length", "error")
+    right = float(finding.fix.partition("about ")[2].partition(" px")[0])
+    assert right == pytest.approx(room.images[0].intrinsics.params[0], rel=0.1)
+
+
+def test_inexact_poses_are_not_taken_for_focal_lengths(room, poses):
+    axes = np.random.default_rng(0).normal(size=(len(poses), 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    turned = np.tile(np.eye(4), (len(poses), 1, 1))
+    turned[:, :3, :3] = Rotation.from_rotvec(np.radians(1.0) * axes).as_matrix()
+    scene = _posed(room, turned @ poses)
+    error = estimate_pose_error(scene, scene.images)
+    assert not error.exact
+    assert not find_focal_length(scene, scene.images, error)

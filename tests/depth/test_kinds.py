@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -55,6 +56,18 @@ def test_a_stated_kind_is_kept_and_contradicted(written, kind, stated):
     assert (finding.kind, finding.severity) == ("depth-kind", "warning")
     assert f"`depth_kind='{kind}'`" in finding.fix
     assert not chosen(written(kind, stated=kind))[2]
+
+
+def test_the_unit_of_a_captures_own_maps_is_named(written):
+    """16-bit maps of 3,000 units are read as millimetres: a third of the scene's unit."""
+    scene = written("z")
+    assert not chosen(scene)[2]  # a network's maps have no unit
+    own = scene.replace(depths=replace(scene.depths, in_scene_units=True))
+    (finding,) = chosen(own)[2]
+    assert (finding.kind, finding.severity) == ("depth-unit-mismatch", "info")
+    assert float(finding.text.partition("by ")[2].split(",")[0]) == pytest.approx(1 / 3, rel=0.01)
+    right = scene.replace(depths=replace(own.depths, scale=3000.0))
+    assert not chosen(right)[2]
 
 
 def test_maps_that_fit_no_kind_are_left_as_they_are(written, rng):

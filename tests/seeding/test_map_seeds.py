@@ -9,11 +9,12 @@ import pytest
 
 import splatseed as ss
 from splatseed.camera import Intrinsics
+from splatseed.depth.kinds import UNIT_MISMATCH
 from splatseed.depthmap import DepthMap, HeldDepths
 from splatseed.methods import SOURCE_CODES
 from splatseed.photos.view import view_of
 from splatseed.pointcloud import PointCloud
-from splatseed.seeding.map_seeds import UNIT_MISMATCH, depth_at_cells, unit_ratio
+from splatseed.seeding.map_seeds import depth_at_cells, unit_ratio
 
 pytestmark = pytest.mark.usefixtures("compare_once")
 DEPTH, COVER = SOURCE_CODES["depth"], SOURCE_CODES["cover"]
@@ -60,14 +61,25 @@ def test_measured_depth_replaces_guesses(room, room_capture, make_maps):
     np.testing.assert_array_equal(without.xyz, guessed.xyz)
 
 
-def test_maps_of_another_unit_or_origin_are_not_used(room, make_maps):
+def test_maps_without_a_unit_or_of_several_are_not_used(room, make_maps):
     """Those of a network, in a folder that the user named, have no unit."""
     found = ss.upsample(room.replace(depths=make_maps(kind=HeldDepths)))
     assert DEPTH not in found.source
     notes = []
-    twice = room.replace(depths=make_maps(lambda z, _: 1.5 * z))
-    assert DEPTH not in ss.upsample(twice, note=notes.append).source
+    several = room.replace(depths=make_maps(lambda z, i: (1.5 + 0.05 * i) * z))
+    assert DEPTH not in ss.upsample(several, note=notes.append).source
     assert notes[-1].kind == UNIT_MISMATCH
+
+
+@pytest.mark.parametrize(("factor", "most"), [(1000.0, 2e-3), (0.4, 0.05)])
+def test_maps_of_another_unit_are_converted(room, room_capture, make_maps, factor, most):
+    notes = []
+    scene = room.replace(depths=make_maps(lambda z, _: factor * z))
+    off = off_surface(ss.upsample(scene, note=notes.append), room_capture, DEPTH)
+    assert len(off) > 300
+    assert off.max() < most  # metres, of 5; a power of ten is exact
+    (unit,) = [note.text for note in notes if note.kind == UNIT_MISMATCH]
+    assert float(unit.partition("depth is ")[2].split()[0]) == pytest.approx(factor, rel=0.01)
 
 
 def test_single_maps_of_another_unit_are_left_out(room, room_capture, make_maps):
@@ -93,7 +105,7 @@ def test_maps_of_another_unit_do_not_guide_stereo(room, make_maps):
     mismatches = [note.text for note in notes if note.kind == UNIT_MISMATCH]
     assert "do not guide stereo" in mismatches[0]
     assert "have another unit" in mismatches[1]
-    assert DEPTH not in seeds.source
+    assert DEPTH in seeds.source
     assert unit_ratio(bare.replace(depths=make_maps()), bare.images) is None
 
 

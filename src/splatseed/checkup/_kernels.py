@@ -1,4 +1,4 @@
-"""Numba kernels: bands of a photograph, and a patch's normalised correlation with their places."""
+"""Numba kernels: bands of a photograph, and where in them patches and points are found again."""
 
 import numpy as np
 
@@ -71,3 +71,61 @@ def correlate_patch(
             known = sums[2, j] == 0.0
             scores[i, j] = scores[i, j] / (np.sqrt(variance * patch.size) * norm) if known else -1.0
     return scores
+
+
+@inline
+def _vertex(before: float, best: float, after: float) -> float:
+    """Where a parabola through three correlations has its peak, from the middle one."""
+    bend = 2.0 * best - before - after
+    return 0.5 * (after - before) / bend if bend > 0.0 else 0.0
+
+
+@inline
+def find_points(
+    first: np.ndarray,  # float64 [H, W]
+    second: np.ndarray,  # float64 [H, W]
+    uv: np.ndarray,  # float64 [M, 2], pixels of points in the first
+    depth: np.ndarray,  # float64 [M], in the first
+    turn: np.ndarray,  # float64 [3, 3]: K_j R K_i^-1
+    shift: np.ndarray,  # float64 [3]: K_j t
+    half: int,
+    reach: int,
+    min_contrast: float,
+) -> np.ndarray:  # float64 [M, 3]
+    """Return how far from its expected place each point is found in the second, and how well.
+
+    The patch of ``2 half + 1`` pixels a side is carried over by the plane through the point that
+    faces the first view, and searched for within ``reach`` pixels. Columns and rows, in pixels of
+    the first view, are those of the peak of a parabola, but whole ones at the border of what is
+    searched; then the correlation. NaN where the patch is bare, or leaves the first photograph.
+    """
+    places = np.full((len(uv), 3), np.nan)
+    side = 2 * half + 1
+    for n in range(len(uv)):
+        x, y = np.empty((side, side)), np.empty((side, side))
+        for a in range(side):
+            for b in range(side):
+                x[a, b] = uv[n, 0] + b - half - 0.5
+                y[a, b] = uv[n, 1] + a - half - 0.5
+        patch = interpolate(first, x, y)
+        if not patch.std() >= min_contrast:  # NaN at the border
+            continue
+        wide = side + 2 * reach
+        x, y = np.full((wide, wide), -1.0), np.full((wide, wide), -1.0)
+        for a in range(wide):
+            for b in range(wide):
+                u, v = uv[n, 0] + b - half - reach, uv[n, 1] + a - half - reach
+                w = depth[n] * (turn[2, 0] * u + turn[2, 1] * v + turn[2, 2]) + shift[2]
+                if w > 0.0:
+                    column = depth[n] * (turn[0, 0] * u + turn[0, 1] * v + turn[0, 2]) + shift[0]
+                    row = depth[n] * (turn[1, 0] * u + turn[1, 1] * v + turn[1, 2]) + shift[1]
+                    x[a, b], y[a, b] = column / w - 0.5, row / w - 0.5
+        scores = correlate_patch(patch, interpolate(second, x, y))
+        best = np.argmax(scores)
+        a, b = best // scores.shape[1], best % scores.shape[1]
+        places[n, 0], places[n, 1], places[n, 2] = b - reach, a - reach, scores[a, b]
+        if 0 < b < 2 * reach:
+            places[n, 0] += _vertex(scores[a, b - 1], scores[a, b], scores[a, b + 1])
+        if 0 < a < 2 * reach:
+            places[n, 1] += _vertex(scores[a - 1, b], scores[a, b], scores[a + 1, b])
+    return places

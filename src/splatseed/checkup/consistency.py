@@ -16,14 +16,16 @@ length, or points that are random, turned, or scaled by 1.3.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
-from numpy.lib.stride_tricks import sliding_window_view
+from jaxtyping import Float64, Int64
 
 from splatseed.camera import Camera
+from splatseed.checkup._kernels import find_points
 from splatseed.photos.loading import load_views
 from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.sources import choose_by_pose
@@ -53,6 +55,10 @@ class _Settings:
     """Maximum number of points per pair of views."""
     max_points: int = 100_000
     """Maximum number of points without tracks."""
+    hidden: int = 6
+    """Points without tracks per point compared: the most alike in colour are."""
+    parts: int = 4
+    """Rows and columns of parts of an image, each of which keeps its share of these."""
     min_points: int = 8
     """Minimum number of common points of a pair."""
     half_patch: int = 3
@@ -70,11 +76,18 @@ class _Settings:
 
 
 CONSISTENCY = _Settings()
-_HALF, _REACH = CONSISTENCY.half_patch, CONSISTENCY.reach
-_PATCH = 2 * _HALF + 1
 
 
-@dataclass(frozen=True)
+class Matches(NamedTuple):
+    """Where patches of a view are found again in another, near the places where they should be."""
+
+    uv: Float64[np.ndarray, "M 2"]  # pixels of the first view
+    depth: Float64[np.ndarray, " M"]  # of the plane that carries the patch to the second view
+    shift: Float64[np.ndarray, "M 2"]
+    """From ``uv`` to the pixel of the first view that the plane carries to the place found."""
+
+
+@dataclass(frozen=True, eq=False)
 class PairFit:
     """How the points that two views share fit them."""
 
@@ -84,9 +97,10 @@ class PairFit:
     tested: int  # with a patch that is not bare; those outside of the first view count
     by_chance: int  # of ``moved`` ones
     moved: int
+    matches: Matches
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fit:
     """How points fit photographs, over all pairs."""
 
@@ -129,6 +143,8 @@ class Hypothesis:
     xyz: Float64[np.ndarray, "P 3"]
     focal_factor: float = 1.0  # by which focal lengths are multiplied
     center_factor: float = 1.0  # by which principal points are multiplied
+    view_factors: Mapping[int, float] = field(default_factory=dict)
+    """By which the focal lengths of some views are multiplied, by index."""
 
 
 @dataclass(eq=False)
@@ -139,6 +155,7 @@ class Evidence:
     images: Sequence[Image]
     given: Hypothesis = field(init=False)  # its distinct original points
     rgb: Float64[np.ndarray, "P 3"] = field(init=False)  # their colours, 0 to 255
+    has_colors: bool = field(init=False)  # whether these differ
     _loaded: dict[int, tuple[View, Grey]] = field(init=False, default_factory=dict)
     _partners: dict[bytes, Int64[np.ndarray, "V K"]] = field(init=False, default_factory=dict)
 
@@ -148,6 +165,8 @@ class Evidence:
         rgb = points.rgb[(points.source == ORIGINAL) & points.distinct].astype(np.float64)
         limit = len(rgb) if self._seen.count else CONSISTENCY.max_points
         self.rgb = strided(rgb, limit)
+        spread = np.abs(self.rgb - self.rgb.mean(axis=0)).mean() if len(rgb) else 0.0
+        self.has_colors = bool(spread >= CONSISTENCY.min_spread)
         poses = np.array([image.cam_from_world for image in self.images])
         self.given = Hypothesis(poses, strided(self._seen.xyz, limit))
         self._factor = factor_for_size(self.images, CONSISTENCY.side)
@@ -174,20 +193,60 @@ class Evidence:
             compared = self._pairs(hypothesis.poses, photographs)
         pairs, errors, unrelated = list[PairFit](), list[np.ndarray](), list[np.ndarray]()
         self._load({i for pair in compared for i in pair}, progress)
+        seen_by = cache(lambda i: self._seen_by(i, hypothesis))
         for number, (i, j) in enumerate(compared):
             progress("compare photographs with points", number / len(compared))
-            cameras = [self._camera(k, hypothesis) for k in (i, j)]
-            rows = strided(self._common(i, j, cameras, hypothesis.xyz), points)
-            if len(rows) < CONSISTENCY.min_points:
+            cameras = self.cameras(i, j, hypothesis)
+            rows = _in_both(seen_by(i), seen_by(j))
+            sample = strided(rows, points)
+            if len(sample) < CONSISTENCY.min_points:
                 continue
-            fit, inside = self._fit_pair(i, j, cameras, hypothesis.xyz[rows])
-            pairs.append(fit)
-            seen, uv = rows[inside], _pixels(cameras[0], hypothesis.xyz[rows[inside]])
-            beneath = self._loaded[i][0].photograph[uv[:, 1], uv[:, 0]]
-            errors.append(np.abs(beneath - self.rgb[seen]).mean(axis=1))
-            others = np.roll(self.rgb[seen], len(seen) // 2, axis=0)
-            unrelated.append(np.abs(beneath - others).mean(axis=1))
+            beneath = self._beneath(i, cameras[0], hypothesis.xyz[sample])
+            inside = ~np.isnan(beneath[:, 0])
+            seen = self.rgb[sample[inside]]
+            errors.append(np.abs(beneath[inside] - seen).mean(axis=1))
+            others = np.roll(seen, len(seen) // 2, axis=0)
+            unrelated.append(np.abs(beneath[inside] - others).mean(axis=1))
+            if self.has_colors and not self._seen.count:
+                sample = self._alike((i, j), cameras, hypothesis.xyz, rows, points)
+            pairs.append(self._fit_pair(i, j, cameras, hypothesis.xyz[sample]))
         return Fit(tuple(pairs), self._color_error(errors, unrelated))
+
+    def _beneath(
+        self, i: int, camera: Camera, xyz: Float64[np.ndarray, "M 3"]
+    ) -> Float64[np.ndarray, "M 3"]:
+        """The colours of a photograph at points; NaN beyond it, and where masks leave it out."""
+        view, colors = self._loaded[i][0], np.full(xyz.shape, np.nan)
+        inside = points_in_image(camera, xyz)
+        column, row = inside.uv.astype(np.int64).T
+        colors[inside.point_idx] = view.photograph[row, column]
+        if view.mask is not None:
+            colors[inside.point_idx[~view.mask[row, column]]] = np.nan
+        return colors
+
+    def _alike(
+        self, pair: tuple[int, int], cameras: Sequence[Camera], xyz: Float64[np.ndarray, "P 3"],
+        rows: Int64[np.ndarray, " M"], points: int,
+    ) -> Int64[np.ndarray, " N"]:  # fmt: skip
+        """Of a larger sample, the points whose colours are most like those of both photographs.
+
+        The coarse z-buffer lets hidden points through, above all foliage's. Each part of the image
+        keeps its share, as distortion and wrong focal lengths show at the borders.
+        """
+        rows = strided(rows, CONSISTENCY.hidden * points)
+        beneath = [
+            self._beneath(k, camera, xyz[rows]) for k, camera in zip(pair, cameras, strict=True)
+        ]
+        errors = np.abs(np.array(beneath) - self.rgb[rows]).mean(axis=2).max(axis=0)
+        uv = np.stack(project(cameras[0].pixels_from_world, xyz[rows])[:2], axis=1)
+        size = np.array([cameras[0].width, cameras[0].height])
+        parts = (uv / size * CONSISTENCY.parts).astype(np.int64) @ [CONSISTENCY.parts, 1]
+        order = np.lexsort((errors, parts))  # NaN last
+        _, start, count = np.unique(parts[order], return_index=True, return_counts=True)
+        rank = np.arange(len(rows)) - np.repeat(start, count)
+        kept = rank * len(rows) < points * np.repeat(count, count)
+        alike = np.sort(rows[order[kept]])
+        return np.asarray(alike[evenly_spaced(len(alike), points)])
 
     def _color_error(self, errors: Sequence[np.ndarray], unrelated: Sequence[np.ndarray]) -> float:
         if not sum(map(len, errors)):
@@ -196,12 +255,6 @@ class Evidence:
         if not self.has_colors or other < 1.0:
             return float("nan")
         return float(np.median(np.concatenate(errors))) / other
-
-    @property
-    def has_colors(self) -> bool:
-        """Whether points have colours that differ."""
-        spread = np.abs(self.rgb - self.rgb.mean(axis=0)).mean() if len(self.rgb) else 0.0
-        return bool(spread >= CONSISTENCY.min_spread)
 
     def _pairs(
         self, poses: Float64[np.ndarray, "V 4 4"], photographs: int
@@ -228,43 +281,48 @@ class Evidence:
         for i, view in zip(missing, views, strict=True):
             self._loaded[i] = view, np.asarray(view.photograph.mean(axis=2))
 
+    def cameras(self, i: int, j: int, hypothesis: Hypothesis) -> tuple[Camera, Camera]:
+        """The cameras of two views that were compared, in pixels of the reduced photographs."""
+        return self._camera(i, hypothesis), self._camera(j, hypothesis)
+
     def _camera(self, i: int, hypothesis: Hypothesis) -> Camera:
         view = self._loaded[i][0]
         K = view.K.copy()
-        K[:2, :2] *= hypothesis.focal_factor
+        K[:2, :2] *= hypothesis.focal_factor * hypothesis.view_factors.get(i, 1.0)
         K[:2, 2] *= hypothesis.center_factor
         return Camera(K, view.width, view.height, hypothesis.poses[i])
 
-    def _common(
-        self, i: int, j: int, cameras: Sequence[Camera], xyz: Float64[np.ndarray, "P 3"]
-    ) -> Int64[np.ndarray, " M"]:
-        """Points that both views see: by tracks if there are any, else by a coarse z-buffer."""
+    def _seen_by(self, i: int, hypothesis: Hypothesis) -> Int64[np.ndarray, " M"]:
+        """Points that a view sees: by tracks if there are any, else by a coarse z-buffer."""
         if self._seen.count:
-            first, second = (self._seen.rows_of(self.images[k]) for k in (i, j))
-        else:
-            first, second = (_nearest_points(camera, xyz) for camera in cameras)
-        return np.asarray(np.intersect1d(first, second))
+            return self._seen.rows_of(self.images[i])
+        return _nearest_points(self._camera(i, hypothesis), hypothesis.xyz)
 
     def _fit_pair(
         self, i: int, j: int, cameras: Sequence[Camera], xyz: Float64[np.ndarray, "M 3"]
-    ) -> tuple[PairFit, Bool[np.ndarray, " M"]]:
-        """Compare points; also return which lie within the first view, at pixels that count."""
-        (view, grey), (_, other) = self._loaded[i], self._loaded[j]
-        inside = np.zeros(len(xyz), bool)
-        inside[points_in_image(cameras[0], xyz).point_idx] = True
-        outside = int(np.count_nonzero(~inside))
-        if view.mask is not None:
-            uv = _pixels(cameras[0], xyz[inside])
-            inside[inside] = view.mask[uv[:, 1], uv[:, 0]]
-        within, center = xyz[inside], cameras[0].center
-        confirmed, textured = _confirm(grey, other, cameras, within)
+    ) -> PairFit:
+        """Compare points."""
+        (_, grey), (_, other) = self._loaded[i], self._loaded[j]
+        outside = len(xyz) - len(points_in_image(cameras[0], xyz).point_idx)
+        within = xyz[~np.isnan(self._beneath(i, cameras[0], xyz)[:, 0])]
+        center = cameras[0].center
+        confirmed, textured, matches = _confirm(grey, other, cameras, within)
         by_chance = moved = 0
         for number, factor in enumerate(CONSISTENCY.moves):  # a part of the points each
             part = within[number :: len(CONSISTENCY.moves)]
             away = center + factor * (part - center)
-            chance, tested = _confirm(grey, other, cameras, away)
+            chance, tested, _ = _confirm(grey, other, cameras, away)
             by_chance, moved = by_chance + chance, moved + tested
-        return PairFit(i, j, confirmed, textured + outside, by_chance, moved), inside
+        return PairFit(i, j, confirmed, textured + outside, by_chance, moved, matches)
+
+
+def _in_both(
+    first: Int64[np.ndarray, " M"], second: Int64[np.ndarray, " N"]
+) -> Int64[np.ndarray, " K"]:
+    """The rows that both have, rising; one may have a row twice."""
+    both = np.zeros((2, 1 + max(first.max(initial=0), second.max(initial=0))), bool)
+    both[0, first] = both[1, second] = True
+    return np.flatnonzero(both.all(axis=0))
 
 
 def _nearest_points(camera: Camera, xyz: Float64[np.ndarray, "P 3"]) -> Int64[np.ndarray, " M"]:
@@ -273,62 +331,25 @@ def _nearest_points(camera: Camera, xyz: Float64[np.ndarray, "P 3"]) -> Int64[np
     return np.asarray(points.point_idx[points.depth <= nearest * (1 + SURFACE)])
 
 
-def _pixels(camera: Camera, xyz: Float64[np.ndarray, "M 3"]) -> Int64[np.ndarray, "M 2"]:
-    """The pixels that points within the image fall into."""
-    column, row, _ = project(camera.pixels_from_world, xyz)
-    return np.stack([column, row], axis=1).astype(np.int64)
-
-
 def _confirm(
     grey: Grey, other: Grey, cameras: Sequence[Camera], xyz: Float64[np.ndarray, "M 3"]
-) -> tuple[int, int]:
-    """Return how many points of a view another confirms, and how many have a patch to search."""
+) -> tuple[int, int, Matches]:
+    """Return how many points of a view another confirms, how many have a patch, and its places."""
     first, second = cameras
     column, row, depth = project(first.pixels_from_world, xyz)
-    uv = np.stack([column, row], axis=1)[:, None, None]
-    patches = _sample(grey, uv + _grid(_HALF))
-    patches = patches - patches.mean(axis=(1, 2), keepdims=True)
-    norms = np.sqrt((patches**2).sum(axis=(1, 2)))
-    with np.errstate(invalid="ignore"):
-        textured = norms >= CONSISTENCY.min_contrast * _PATCH
-    if not textured.any():
-        return 0, 0
-    patches, norms = patches[textured] / norms[textured, None, None], norms[textured]
     # X_j = z (R K_i^-1) (u, v, 1) + t for the plane at depth z that faces i.
     relative = second.cam_from_world @ first.world_from_cam
-    around = uv[textured] + _grid(_HALF + _REACH)
-    rays = np.concatenate([around, np.ones((*around.shape[:3], 1))], axis=-1)
-    rays = rays @ (second.K @ relative[:3, :3] @ np.linalg.inv(first.K)).T
-    places = depth[textured, None, None, None] * rays + second.K @ relative[:3, 3]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        bands = _sample(
-            other, np.where(places[..., 2:] > 0, places[..., :2] / places[..., 2:], -1.0)
-        )
-    windows = sliding_window_view(bands, (_PATCH, _PATCH), axis=(1, 2))
-    deviation = windows.std(axis=(-1, -2)) * _PATCH
-    scores = np.einsum("nabij,nij->nab", windows, patches) / np.maximum(deviation, 1e-3)
-    scores = np.where(np.isfinite(scores), scores, -1.0).reshape(len(scores), -1)
-    best = scores.argmax(axis=1)
-    miss = np.linalg.norm(_grid(_REACH).reshape(-1, 2)[best], axis=1)
-    found = scores[np.arange(len(best)), best] >= CONSISTENCY.min_correlation
-    return int(np.count_nonzero(found & (miss <= CONSISTENCY.max_miss))), len(scores)
-
-
-def _grid(half: int) -> Float64[np.ndarray, "S S 2"]:
-    """Offsets (column, row) of the pixels of a square around its centre."""
-    steps = np.arange(-half, half + 1.0)
-    return np.stack(np.meshgrid(steps, steps), axis=-1)
-
-
-def _sample(image: Grey, uv: Float64[np.ndarray, "... 2"]) -> Float64[np.ndarray, "..."]:
-    """Interpolate an image at pixels; NaN outside of the centres of its outermost pixels."""
-    height, width = image.shape
-    x, y = uv[..., 0] - 0.5, uv[..., 1] - 0.5
-    inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
-    x, y = np.where(inside, x, 0.0), np.where(inside, y, 0.0)
-    column = np.minimum(x.astype(np.int64), width - 2)
-    row = np.minimum(y.astype(np.int64), height - 2)
-    s, t, flat, at = x - column, y - row, image.ravel(), row * width + column
-    upper = (1 - s) * flat[at] + s * flat[at + 1]
-    lower = (1 - s) * flat[at + width] + s * flat[at + width + 1]
-    return np.where(inside, (1 - t) * upper + t * lower, np.nan)
+    uv = np.stack([column, row], axis=1)
+    places = find_points(
+        grey, other, uv, depth,
+        second.K @ relative[:3, :3] @ np.linalg.inv(first.K), second.K @ relative[:3, 3],
+        CONSISTENCY.half_patch, CONSISTENCY.reach, CONSISTENCY.min_contrast,
+    )  # fmt: skip
+    textured = ~np.isnan(places[:, 2])
+    uv, depth, places = uv[textured], depth[textured], places[textured]
+    near = np.hypot(*np.rint(places[:, :2]).T) <= CONSISTENCY.max_miss
+    found = places[:, 2] >= CONSISTENCY.min_correlation
+    # At the border of what is searched the best place may lie beyond.
+    within = found & (np.abs(places[:, :2]).max(axis=1, initial=0.0) <= CONSISTENCY.reach - 0.5)
+    matches = Matches(uv[within], depth[within], places[within, :2])
+    return int(np.count_nonzero(near & found)), len(places), matches

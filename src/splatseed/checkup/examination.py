@@ -1,10 +1,11 @@
 """The examination: photographs, poses, intrinsics and points held against each other, in seconds.
 
 Points that photographs support (``consistency``) confirm poses and intrinsics. Where they do not,
-what people's tools do to a capture is tried, in this order: focal lengths of another size; poses of
-another convention, by comparing photographs without the points, which refuses the capture; points
-in other axes, or of another scale. Points count as *unfit* only if photographs agree at the poses
-and see surfaces elsewhere than the points; nothing is said of what cannot be decided (*unclear*).
+what people's tools do to a capture is tried, in this order: lens distortion and focal lengths, of
+which small errors show even where points fit; poses of another convention, by comparing photographs
+without the points, which refuses the capture; points in other axes, or of another scale. Points
+count as *unfit* only if photographs agree at the poses and see surfaces elsewhere than the points;
+nothing is said of what cannot be decided (*unclear*).
 """
 
 from __future__ import annotations
@@ -17,6 +18,13 @@ import numpy as np
 
 from splatseed.checkup.choices import UnfitPoints
 from splatseed.checkup.consistency import Evidence, Fit
+from splatseed.checkup.distortion import distortion_finding, find_distortion
+from splatseed.checkup.focal_lengths import (
+    WRONG_FOCAL_LENGTH,
+    camera_groups,
+    find_focal_factors,
+    focal_factor_findings,
+)
 from splatseed.checkup.hypotheses import Affine, Found, find_axes, find_intrinsics, find_similarity
 from splatseed.checkup.poses import WrongConventionError, check_poses, compare_samples
 from splatseed.depth.stereo.maps import MIN_POINTS, StereoMap
@@ -28,7 +36,6 @@ from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 
 UNFIT_POINTS = "points-do-not-fit"
-WRONG_FOCAL_LENGTH = "wrong-focal-length"
 
 
 @dataclass(frozen=True)
@@ -45,6 +52,11 @@ class _Settings:
     """Support of points that are unfit; wrong ones reached 0.09."""
     max_unlike: float = 0.55
     """Colour error from which on points may be unfit."""
+    unrelated: float = 0.85
+    """Colour error of points whose colours say nothing of the photographs; right ones reached
+    0.58."""
+    max_unrelated: float = 0.3
+    """Support of unfit points of such colours: cameras close together confirm a part of any."""
     min_tested: int = 100
     """Minimum number of points compared, to report that photographs agree nowhere."""
     min_surface: int = 100
@@ -76,13 +88,19 @@ class CheckUp:
 UNCLEAR = CheckUp("unclear")
 
 
-def examine(scene: Scene, images: Sequence[Image], progress: Progress = silent) -> CheckUp:
+def examine(
+    scene: Scene,
+    images: Sequence[Image],
+    progress: Progress = silent,
+    evidence: Evidence | None = None,
+) -> CheckUp:
     """Hold the points of a scene against photographs and poses.
 
     Args:
         scene: A scene; without points or photographs, nothing is found.
         images: Those of its images that may be compared.
         progress: Called with the stage and the fraction done.
+        evidence: That of these images, which keeps the photographs that it has read.
 
     Raises:
         SceneFormatError: The poses are of another convention: the same error as without points.
@@ -91,7 +109,7 @@ def examine(scene: Scene, images: Sequence[Image], progress: Progress = silent) 
     if len(images) < 2 or np.count_nonzero(originals.distinct) < MIN_POINTS:
         return UNCLEAR
     try:
-        return _examine(scene, images, progress)
+        return _examine(scene, images, progress, evidence or Evidence(scene, images))
     except WrongConventionError:
         raise
     except SplatseedError:  # photographs that cannot be used, which the reader of them reports
@@ -100,15 +118,17 @@ def examine(scene: Scene, images: Sequence[Image], progress: Progress = silent) 
         progress("check points", 1.0)
 
 
-def _examine(scene: Scene, images: Sequence[Image], progress: Progress) -> CheckUp:
+def _examine(
+    scene: Scene, images: Sequence[Image], progress: Progress, evidence: Evidence
+) -> CheckUp:
     progress("check points", 0.0)
-    evidence = Evidence(scene, images)
     fit = evidence.fit(evidence.given)
     enough = fit.tested >= EXAMINATION.min_confirming
-    fits = fit.support >= EXAMINATION.min_support and enough
-    if fit.tested and (found := find_intrinsics(evidence, fit, nearby=fits)):
-        finding = _focal_finding(images, fit, found)
-        return CheckUp("fit" if fits else "unclear", fit, findings=(finding,))
+    unrelated = fit.color_error >= EXAMINATION.unrelated
+    needed = EXAMINATION.max_unrelated if unrelated else EXAMINATION.min_support
+    fits = fit.support >= needed and enough
+    if fit.tested and (findings := _camera_findings(evidence, fit, fits=fits)):
+        return CheckUp("fit" if fits else "unclear", fit, findings=findings)
     if fits:
         return CheckUp("fit", fit)
     progress("check points", 0.3)
@@ -118,10 +138,29 @@ def _examine(scene: Scene, images: Sequence[Image], progress: Progress) -> Check
         raise
     except SceneFormatError as refused:
         return CheckUp("unclear", fit, findings=_disagreement(fit, refused))
-    if fit.support > EXAMINATION.max_unfit or fit.color_error < EXAMINATION.max_color_error:
+    most = EXAMINATION.max_unrelated if unrelated else EXAMINATION.max_unfit
+    if fit.support > most or fit.color_error < EXAMINATION.max_color_error:
         return CheckUp("unclear", fit)
     progress("check points", 0.6)
     return _examine_frame(evidence, images, fit)
+
+
+def _camera_findings(evidence: Evidence, fit: Fit, *, fits: bool) -> tuple[Finding, ...]:
+    """Find lens distortion or focal lengths that fit the photographs better than the given."""
+    images, groups = evidence.images, camera_groups(evidence.images)
+    better: list[tuple[float, tuple[Finding, ...]]] = []
+    if distortion := find_distortion(evidence, fit, groups):
+        finding = distortion_finding(evidence.scene, images, groups, distortion)
+        better.append((distortion.fit.support, (finding,)))
+    start, there = evidence.given, fit
+    if found := find_intrinsics(evidence, fit, nearby=fits):
+        start, there = found.hypothesis, found.fit
+        better.append((there.support, (_focal_finding(images, fit, found),)))
+    scaled = start.center_factor != 1.0 or (found and not max(groups))
+    if not scaled and (factors := find_focal_factors(evidence, there, start, groups)):
+        named = focal_factor_findings(images, groups, factors)
+        better.append((factors.after.support, named))
+    return max(better, key=lambda each: each[0])[1] if better else ()
 
 
 def _examine_frame(evidence: Evidence, images: Sequence[Image], fit: Fit) -> CheckUp:
@@ -140,8 +179,9 @@ def _examine_frame(evidence: Evidence, images: Sequence[Image], fit: Fit) -> Che
     ):
         return CheckUp("unclear", fit)
     text = (
-        f"Photographs confirm {fit.confirmed:.0%} of the points where they are, no more than by "
-        "chance, and see surfaces elsewhere: the points are random, or of another scene or frame."
+        f"Photographs confirm {fit.confirmed:.0%} of the points where they are, {fit.chance:.0%} "
+        "by chance, and see surfaces elsewhere: the points are random, or of another scene or "
+        "frame."
     )
     return CheckUp("unfit", fit, findings=(_unfit_finding(text),))
 

@@ -19,6 +19,7 @@ from splatseed.checkup.consistency import Evidence, Fit, Hypothesis
 from splatseed.depth.stereo.maps import MIN_POINTS
 from splatseed.pointcloud import PointCloud
 from splatseed.sampling import strided
+from splatseed.scene import Image
 from splatseed.similarity import Similarity, fit_similarity
 
 Points = Float64[np.ndarray, "N 3"]
@@ -93,12 +94,14 @@ def find_intrinsics(evidence: Evidence, fit: Fit, *, nearby: bool) -> Found | No
     given = evidence.given
     factors = SEARCH.nearby_factors if nearby else SEARCH.all_factors
     tried = [replace(given, focal_factor=factor) for factor in factors]
-    center = _centering_factor(evidence)
+    center = centering_factor(evidence.images)
     if center is not None:
         tried.append(replace(given, focal_factor=center, center_factor=center))
     base = _quick(evidence, given)
     best = _best(evidence, tried)
-    if best is None or not is_better(best.fit, base):
+    # Between two factors of a search few points may fit; all are compared below.
+    near = not nearby and best is not None and best.fit.support >= SEARCH.min_support / 2
+    if best is None or not (near or is_better(best.fit, base)):
         return None
     hypothesis = best.hypothesis
     if hypothesis.center_factor == 1.0:  # else the factor is exact
@@ -116,12 +119,9 @@ def _refined(evidence: Evidence, hypothesis: Hypothesis) -> Hypothesis:
     return replace(hypothesis, focal_factor=float(np.clip(vertex, factors[0], factors[-1])))
 
 
-def _centering_factor(evidence: Evidence) -> float | None:
+def centering_factor(images: Sequence[Image]) -> float | None:
     """The factor that brings off-centre principal points to the centre of their images."""
-    ratios = [
-        2 * image.K[0, 2] / image.lens.width if image.lens.width else 1.0
-        for image in evidence.images
-    ]
+    ratios = [2 * image.K[0, 2] / image.lens.width if image.lens.width else 1.0 for image in images]
     ratio = float(np.median(ratios))
     return 1 / ratio if ratio > 0 and abs(ratio - 1) > 0.04 else None
 

@@ -4,13 +4,15 @@ Errors of pose move points off their epipolar lines. Corners of view i are searc
 which is first rotated into i's orientation, so that a point at inverse depth w moves from pixel p
 to ``K (K^-1 p + w c)``, c the translation: a straight line. A corner's *miss* is the distance from
 this line at which it is found, in pixels, where one place correlates clearly best. The median over
-a pair's corners, and then over the pairs, is the error. Masked pixels are no corners.
+a pair's corners, and then over the pairs, is the error. Masked pixels are no corners. Wrong focal
+lengths move points off their lines, too, unless cameras only move sideways: of several factors, the
+right one has by far the smallest error.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -108,26 +110,67 @@ def estimate_pose_error(
     Returns None if too few corners are found again, as on plain walls or with poses that are far
     off.
     """
+    return _of_pairs(images, _load_pairs(scene, images, progress))
+
+
+def estimate_focal_errors(
+    scene: Scene,
+    images: Sequence[Image],
+    factors: Sequence[tuple[float, float]],
+    progress: Progress = silent,
+) -> dict[tuple[float, float], float]:
+    """Return the error in pixels with focal lengths and principal points multiplied by factors.
+
+    Those with which too few corners are found again are left out.
+    """
+    pairs = list(_load_pairs(scene, images, silent))
+    errors: dict[tuple[float, float], float] = {}
+    for number, factor in enumerate(factors):
+        error = _of_pairs(images, [[_zoomed(view, *factor) for view in pair] for pair in pairs])
+        errors |= {} if error is None else {factor: error.px}
+        progress("try focal lengths", (number + 1) / len(factors))
+    return errors
+
+
+def _zoomed(view: View, focal: float, center: float) -> View:
+    K = view.K.copy()
+    K[:2, :2] *= focal
+    K[:2, 2] *= center
+    return replace(view, camera=replace(view.camera, K=K))
+
+
+def _load_pairs(
+    scene: Scene, images: Sequence[Image], progress: Progress
+) -> Iterator[Sequence[View]]:
+    """Load a few views, each with its partners, one after the other."""
     poses = np.array([image.camera.cam_from_world for image in images])
     partners = choose_by_pose(poses, POSE_ACCURACY.partners)
     factor = factor_for_size(images, POSE_ACCURACY.side)
     chosen = evenly_spaced(len(images), POSE_ACCURACY.photographs).tolist()
-    errors, pairs = [], 0
     for number, i in enumerate(chosen):
         compared = [images[i], *(images[j] for j in partners[i].tolist() if j >= 0)]
-        view, *others = load_views(scene, compared, data_factor=factor, undistort=True)
+        yield load_views(scene, compared, data_factor=factor, undistort=True, draft=True)
+        progress("measure poses", (number + 1) / len(chosen))
+
+
+def _of_pairs(
+    images: Sequence[Image], compared: Iterable[Sequence[View]]
+) -> PoseErrorEstimate | None:
+    """Estimate the error of views, each with its partners."""
+    errors, pairs = [], 0
+    for view, *others in compared:
         pairs += len(others)
         for other in others:
             misses = np.abs(_misses(view, other))
             if len(misses) >= POSE_ACCURACY.min_found:
                 px = float(np.median(misses))
                 errors.append((px, np.degrees(np.arctan(px / view.K[0, 0]))))
-        progress("measure poses", (number + 1) / len(chosen))
     if len(errors) < max(1.0, POSE_ACCURACY.min_pairs * pairs):
         return None
     px, degrees = np.median(errors, axis=0).tolist()
     if px > POSE_ACCURACY.max_median:
         return None
+    factor = factor_for_size(images, POSE_ACCURACY.side)
     stereo_factor = factor_for_size(images, StereoSettings.max_size)
     px *= factor / stereo_factor
     side = max(max(image.camera.width, image.camera.height) for image in images)

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.camera import Camera
+from splatseed.checkup.focal_by_pairs import find_focal_length
 from splatseed.checkup.pose_accuracy import estimate_pose_error
 from splatseed.depth.stereo.coarse import prior_from_baseline
 from splatseed.depth.stereo.maps import StereoResult, StereoSettings
@@ -144,6 +145,9 @@ def _disagreement(
             fix=f"Take more photographs in between, or estimate new poses: {sfm}.",
         )
     error = estimate_pose_error(scene, images)
+    # With points, focal lengths have been tried by them.
+    if not len(scene.points) and (other := find_focal_length(scene, images, error)):
+        return SceneFormatError(expected, found=other[0].text.rstrip("."), fix=other[0].fix)
     inexact = error is not None and not error.exact
     found = f"a depth that others confirm at {agreement:.1%} of their pixels"
     new_poses = f"or estimate new poses: {sfm}."
@@ -235,7 +239,7 @@ def compare_sample(
     idx = [first, *partners[partners >= 0].tolist()]
     chosen = [images[i] for i in idx]
     factor = factor_for_size(chosen, POSE_CHECK.side)
-    loaded = load_views(scene, chosen, data_factor=factor, undistort=True)
+    loaded = load_views(scene, chosen, data_factor=factor, undistort=True, draft=True)
     views = [view.posed(poses[i]) for view, i in zip(loaded, idx, strict=True)]
     sources = choose_by_pose(poses[idx], POSE_CHECK.partners)
     priors = [prior_from_baseline(views, i, others) for i, others in enumerate(sources)]

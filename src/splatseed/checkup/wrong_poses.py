@@ -5,29 +5,31 @@ fraction of its points that photographs confirm, over the pairs in which it take
 wrong pose is about 0, whereas its right partners have other pairs. Where the share is at most
 ``max_share`` of the median, and that of every pair at most twice as much, the photograph is
 compared with more partners and with those before and after it by name; it is named if all of them
-say the same. Photographs that share too few points with others are not checked.
+say the same. If its points fit with another focal length, that is named instead. Photographs that
+share too few points with others are not checked.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from splatseed.checkup.consistency import Evidence, PairFit
 from splatseed.checkup.examination import comparable
+from splatseed.checkup.focal_lengths import WRONG_FOCAL_LENGTH, search_factor
 from splatseed.depth.stereo.maps import MIN_POINTS
 from splatseed.errors import SplatseedError
 from splatseed.findings import Finding
 from splatseed.progress import Progress, silent
 from splatseed.sampling import strided
 from splatseed.scene import Image, Scene
-from splatseed.text import agreeing, counted
+from splatseed.text import agreeing, counted, name_some
 
 WRONG_POSES = "wrong-poses"
-SAMPLE = 100
+SAMPLE = 150
 """Photographs that ``splatseed info`` compares unless it is to compare all."""
 NAMED = 8
 """Photographs named in the text; all are subjects of the finding."""
@@ -43,10 +45,13 @@ class _Settings:
     """With fewer photographs none is checked."""
     min_tested: int = 16
     """Points that a photograph must share with others to be checked."""
-    min_median: float = 0.25
+    min_median: float = 0.2
     """Median share below which no photograph is checked."""
     max_share: float = 0.25
     """Share of a wrong pose, as a fraction of the median."""
+    searched: int = 8
+    partners: int = 4
+    """Photographs whose focal length may be wrong instead of the pose, and views to find it by."""
     max_wrong: float = 0.3
     """Fraction of the photographs above which they are not single ones: nothing is said."""
 
@@ -55,7 +60,11 @@ SINGLE = _Settings()
 
 
 def find_wrong_poses(
-    scene: Scene, images: Sequence[Image], progress: Progress = silent, limit: int | None = None
+    scene: Scene,
+    images: Sequence[Image],
+    progress: Progress = silent,
+    limit: int | None = None,
+    evidence: Evidence | None = None,
 ) -> tuple[Finding, ...]:
     """Name photographs whose poses do not fit the points that others see; nothing without points.
 
@@ -64,34 +73,61 @@ def find_wrong_poses(
         images: Its images to compare.
         progress: Called with the stage and the fraction done.
         limit: The maximum number of photographs to compare, spread evenly; None: all.
+        evidence: That of the images, which keeps the photographs that it has read.
     """
     points = scene.points.originals
-    images = images if limit is None else strided(images, limit)
+    if limit is not None and len(images) > limit:
+        images, evidence = strided(images, limit), None
     too_few = len(images) < SINGLE.min_photographs
     if too_few or np.count_nonzero(points.distinct) < MIN_POINTS:
         return ()
-    evidence = Evidence(scene, images)
+    evidence = evidence or Evidence(scene, images)
     try:
         fit = evidence.fit(
             evidence.given, points=SINGLE.points, photographs=len(images), progress=progress
         )
     except SplatseedError:  # photographs that cannot be used, which the reader of them reports
         return ()
-    suspects = _wrong(fit.pairs)
+    max_share = SINGLE.max_share * _median_share(fit.pairs)
+    suspects = _wrong(fit.pairs, max_share)
     further = [(i, j) for i in suspects for j in _more_partners(evidence, i)]
-    confirmed = _wrong([*fit.pairs, *evidence.fit(evidence.given, compared=further).pairs])
-    wrong = tuple(images[i].name for i in confirmed if i in suspects)
+    more_pairs = evidence.fit(evidence.given, compared=further).pairs
+    confirmed = _wrong([*fit.pairs, *more_pairs], max_share)
+    wrong = [i for i in confirmed if i in suspects]
     if not wrong or len(wrong) > SINGLE.max_wrong * len(images):
         return ()
-    more = len(wrong) - NAMED
-    names = ", ".join(wrong[:NAMED]) + (f" and {more:,} more" if more > 0 else "")
+    factors = {i: _focal_factor(evidence, i) for i in wrong[: SINGLE.searched]}
+    zoomed = {images[i].name: factor for i, factor in factors.items() if factor is not None}
+    turned = tuple(images[i].name for i in wrong if images[i].name not in zoomed)
+    findings = (_focal_finding(zoomed),) if zoomed else ()
+    return (*findings, _pose_finding(turned)) if turned else findings
+
+
+def _focal_factor(evidence: Evidence, i: int) -> float | None:
+    """The factor of a photograph's focal length with which its pose fits; None without any."""
+    near = evidence.candidates(i, evidence.given.poses)[: SINGLE.partners]
+    return search_factor(evidence, evidence.given, [i], [(i, j) for j in near])
+
+
+def _focal_finding(factors: Mapping[str, float]) -> Finding:
+    each = name_some([f"{name} ({factor:.3g} times)" for name, factor in factors.items()], NAMED)
+    text = (
+        f"Points that other photographs confirm fit {counted(len(factors), 'photograph')} with "
+        f"another focal length: {each}."
+    )
+    fix = "Correct it, or leave them out of seeds and training: `drop_wrong_poses=True`."
+    return Finding(WRONG_FOCAL_LENGTH, text, "error", tuple(factors), fix=fix)
+
+
+def _pose_finding(wrong: tuple[str, ...]) -> Finding:
     which = agreeing(len(wrong), "its pose is", "their poses are")
+    shows = agreeing(len(wrong), "it shows", "they show")
     text = (
         f"Points that other photographs confirm do not fit {counted(len(wrong), 'photograph')}: "
-        f"{names}; {which} wrong, or {agreeing(len(wrong), 'it shows', 'they show')} other things."
+        f"{name_some(wrong, NAMED)}; {which} wrong, or {shows} other things."
     )
     leave = "`drop_wrong_poses=True` leaves them out of seeds and training."
-    return (Finding(WRONG_POSES, text, "error", wrong, fix=leave),)
+    return Finding(WRONG_POSES, text, "error", wrong, fix=leave)
 
 
 def _more_partners(evidence: Evidence, i: int) -> list[int]:
@@ -100,23 +136,30 @@ def _more_partners(evidence: Evidence, i: int) -> list[int]:
     return sorted({*near, *beside})
 
 
-def _wrong(pairs: Sequence[PairFit]) -> list[int]:
-    """Return the indices of the views whose pairs all fail."""
+def _pairs_of_views(pairs: Sequence[PairFit]) -> dict[int, list[PairFit]]:
+    """The pairs of each view that shares enough points with others."""
     of_view: dict[int, list[PairFit]] = defaultdict(list)
     for pair in pairs:
         of_view[pair.first].append(pair)
         of_view[pair.second].append(pair)
-    shares = {i: _share(each) for i, each in of_view.items() if _tested(each) >= SINGLE.min_tested}
-    if not shares:
-        return []
-    median = float(np.median(list(shares.values())))
-    if median < SINGLE.min_median:
-        return []
-    limit = SINGLE.max_share * median
+    return {i: each for i, each in of_view.items() if _tested(each) >= SINGLE.min_tested}
+
+
+def _median_share(pairs: Sequence[PairFit]) -> float:
+    """The median view's share; 0, at which none is wrong, where it is too low."""
+    median = float(np.median([*map(_share, _pairs_of_views(pairs).values())] or [0.0]))
+    return median if median >= SINGLE.min_median else 0.0
+
+
+def _wrong(pairs: Sequence[PairFit], limit: float) -> list[int]:
+    """Return the indices of the views whose pairs all fail: their share is at most ``limit``."""
     return sorted(
         i
-        for i, share in shares.items()
-        if share <= limit and len(of_view[i]) > 1 and max(map(_pair_share, of_view[i])) <= 2 * limit
+        for i, each in _pairs_of_views(pairs).items()
+        if limit > 0
+        and len(each) > 1
+        and _share(each) <= limit
+        and max(map(_pair_share, each)) <= 2 * limit
     )
 
 
@@ -147,7 +190,7 @@ def leave_out(scene: Scene, wrong: Collection[str]) -> tuple[Scene, tuple[Findin
         return scene, ()
     images = tuple(image for image in scene.images if image.name not in names)
     left = scene.replace(images=images, absent=(*scene.absent, *names))
-    which = agreeing(len(names), "with a wrong pose is", "with wrong poses are")
+    which = agreeing(len(names), "that does not fit the points is", "that do not fit the points are")
     text = f"{counted(len(names), 'photograph')} {which} left out: "
     text += f"{', '.join(names[:NAMED])}{' ...' if len(names) > NAMED else ''}."
     return left, (Finding(WRONG_POSES, text, "info", names),)

@@ -73,8 +73,11 @@ class CaptureCheck:
     @property
     def first(self) -> str:
         """What must be mended first, as an imperative; empty if there is nothing."""
-        if any(each.kind == "wrong-focal-length" for each in self.findings):
+        kinds = {each.kind for each in self.findings}
+        if "wrong-focal-length" in kinds:
             return "correct the focal length first, as the line at the top says"
+        if "wrong-distortion" in kinds:
+            return "correct the lens distortion first, as the line at the top says"
         if self.poses is not None and self.poses.wrong:
             return "correct the poses first, as the line at the top says"
         return ""
@@ -133,17 +136,20 @@ def check_capture(
     """
     if not scene.has_photographs:
         return CaptureCheck(None, None, ())
+    from splatseed.checkup.consistency import Evidence
     from splatseed.checkup.examination import comparable, examine
     from splatseed.checkup.wrong_poses import SAMPLE, find_wrong_poses
 
     points, refused, single = None, None, tuple[Finding, ...]()
+    images = comparable(scene)
+    evidence = Evidence(scene, images) if len(images) > 1 else None
     try:
-        points = examine(scene, comparable(scene), progress)
+        points = examine(scene, images, progress, evidence)
     except SplatseedError as error:
         refused = error
-    if points is not None and points.confirms_poses:
+    if points is not None and points.confirms_poses and not points.findings:
         limit = None if all_photographs else SAMPLE
-        single = find_wrong_poses(scene, comparable(scene), progress, limit)
+        single = find_wrong_poses(scene, images, progress, limit, evidence)
     return CaptureCheck(points, _check_poses(scene, masked, refused, progress), single)
 
 
@@ -155,6 +161,7 @@ def _check_poses(
     ``refused`` is why the examination of points refuses the poses. Else a scene with points has no
     doubts: it can be trained from them.
     """
+    from splatseed.checkup.focal_by_pairs import find_focal_length
     from splatseed.checkup.pose_accuracy import INEXACT_POSES, estimate_pose_error, given_pose_error
     from splatseed.checkup.poses import (
         InexactPosesError,
@@ -177,5 +184,6 @@ def _check_poses(
     if has_points(scene):
         return PoseCheck(agreement, estimate_pose_error(scene, images, progress))
     pose_error = given_pose_error(scene, images, progress)
-    doubts = pose_error.findings if pose_error else ()
+    doubts = find_focal_length(scene, images, pose_error, progress)
+    doubts = doubts or (pose_error.findings if pose_error else ())
     return PoseCheck(agreement, pose_error, doubts, agreement_findings(agreement, masked))

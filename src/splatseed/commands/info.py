@@ -83,7 +83,7 @@ class Options:
     trainer: Annotated[TrainerName, tyro.conf.arg(name="for")] = "splatseed"
     """The trainer that you plan to use: the advice and the commands are for it."""
     all_photographs: bool = False
-    """Compare all photographs with the points, not 100 at most, to find single wrong poses."""
+    """Compare all photographs with the points, not 150 at most, to find single wrong poses."""
     json: bool = False
     """Print one JSON object instead, for scripts."""
 
@@ -292,14 +292,16 @@ def _unit_mismatch(scene: Scene, poses: PoseCheck | None) -> tuple[Finding, ...]
     """Report depth maps of another unit than the poses, unless the poses cannot be checked."""
     if not in_scene_units(scene.depths) or poses is None or not poses.agreement:
         return ()
-    from splatseed.seeding.map_seeds import UNIT_MISMATCH, unit_ratio
+    from splatseed.depth.kinds import UNIT_MISMATCH
+    from splatseed.seeding.map_seeds import unit_ratio
 
     ratio = unit_ratio(scene, photographed(scene))
     if ratio is None:
         return ()
     times = f"their depth is {ratio:.4g} times that of the photographs"
-    text = f"the depth maps are in another unit than the poses: {times}"
-    return (Finding(UNIT_MISMATCH, text, "error"),)
+    text = f"the depth maps are in another unit than the poses: {times}."
+    fix = "Method auto divides by it; other methods and trainers need the right unit."
+    return (Finding(UNIT_MISMATCH, text, "error", fix=fix),)
 
 
 def _next(

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from splatseed.checkup.poses import compare_samples
 from splatseed.depth._kernels import find_edges
 from splatseed.depth.alignment import LIMITS, map_camera
+from splatseed.depth.kinds import UNIT_MISMATCH
 from splatseed.depth.settings import DepthSettings
 from splatseed.depth.stereo.maps import StereoResult
 from splatseed.depthmap import MIN_CONFIDENCE, DepthMap, DepthMaps
@@ -43,11 +44,10 @@ CellMap = Float32[np.ndarray, "rows cols"]
 class _MapSettings:
     confidence: float = 0.5  # of a seed: above cover's guesses, below what photographs confirm
     tolerance: float = 0.05  # relative depth by which a view must see past a seed
+    same_unit: float = 1.05  # ratio of factors that are one unit
 
 
 MAPS = _MapSettings()
-UNIT_MISMATCH = "depth-unit-mismatch"
-"""Kind of the finding that depth maps have another unit than the poses."""
 
 
 def seeds_from_maps(
@@ -88,7 +88,8 @@ def in_scene_unit(
 ) -> tuple[list[CellMap], tuple[Finding, ...]]:
     """Return the maps without those whose depth contradicts the photographs', and a finding on it.
 
-    A map with too few cells that photographs confirm is compared by those of all maps.
+    A map with too few cells that photographs confirm is compared by those of all maps. If all are
+    off by the same factor, they have another unit, and are divided by it.
 
     Args:
         stereo: Stereo of the photographs.
@@ -102,6 +103,12 @@ def in_scene_unit(
     wrong = [i for i in known if not _same_unit(ratios[i] if enough[i] else pooled)]
     if not wrong:
         return list(maps), ()
+    if wrong == known and (unit := _common_factor([ratios[i] for i in known])) is not None:
+        text = (
+            "The scene's depth maps have another unit than its poses: their depth is "
+            f"{unit:.4g} times that of the photographs, and is divided by it."
+        )
+        return [each / np.float32(unit) for each in maps], (Finding(UNIT_MISMATCH, text),)
     kept = [np.full_like(each, np.nan) if i in wrong else each for i, each in enumerate(maps)]
     factor = f"{np.median(np.concatenate([ratios[i] for i in wrong])):.4g}"
     left_out = tuple(names[i] for i in wrong)
@@ -141,6 +148,21 @@ def _same_unit(ratios: Float64[np.ndarray, " M"]) -> bool:
     if len(ratios) < LIMITS.unit_points:
         return True
     return bool(1.0 / LIMITS.unit_factor < np.median(ratios) < LIMITS.unit_factor)
+
+
+def _common_factor(ratios: Sequence[Float64[np.ndarray, " M"]]) -> float | None:
+    """The factor by which all maps' depth is off; None if they, or the parts of one, differ.
+
+    A power of ten is taken to be exact.
+    """
+    factors = [float(np.median(each)) for each in ratios if len(each) >= LIMITS.unit_points]
+    if not factors or max(factors) > MAPS.same_unit * min(factors):
+        return None
+    low, factor, high = np.percentile(np.concatenate(ratios), [25, 50, 75])
+    if high > MAPS.same_unit * low:
+        return None
+    power = 10.0 ** np.round(np.log10(factor))
+    return float(power if abs(factor / power - 1) < MAPS.same_unit - 1 else factor)
 
 
 def _ratios(stereo: StereoResult, i: int, known: CellMap) -> Float64[np.ndarray, " M"]:

@@ -138,7 +138,8 @@ class Stereo(PhotographMethod):
             return scene, ()
         if not self.depth_maps:
             return scene.replace(depths=None), ()
-        from splatseed.seeding.map_seeds import UNIT_MISMATCH, unit_ratio
+        from splatseed.depth.kinds import UNIT_MISMATCH
+        from splatseed.seeding.map_seeds import unit_ratio
 
         ratio = unit_ratio(scene, images)
         if ratio is None:
@@ -353,9 +354,11 @@ def _check_given_poses(
     scene: Scene, images: Sequence[Image], progress: Progress
 ) -> tuple[Finding, ...]:
     """Check the poses of a scene without points."""
+    from splatseed.checkup.focal_by_pairs import find_focal_length
     from splatseed.checkup.pose_accuracy import given_pose_error
     from splatseed.checkup.poses import agreement_findings, check_poses
 
     faint = agreement_findings(check_poses(scene, images, progress), stated=True)
     error = given_pose_error(scene, images, progress)
-    return (*faint, *(error.findings if error else ()))
+    wrong = find_focal_length(scene, images, error, progress)
+    return (*faint, *(wrong or (error.findings if error else ())))

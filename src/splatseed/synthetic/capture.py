@@ -90,8 +90,14 @@ def make_capture(
             fix="Pass larger values.",
         )
     rng = np.random.default_rng(seed)
-    room = build_room(rng)
-    cameras = orbit_cameras(num_views, width, height)
+    return photograph_room(build_room(rng), orbit_cameras(num_views, width, height), rng)
+
+
+def photograph_room(room: Room, cameras: Sequence[Camera], rng: np.random.Generator) -> Capture:
+    """Render photographs of a room, and simulate Structure-from-Motion points with ``rng``.
+
+    The cameras share their intrinsics.
+    """
     images, depths = render_views(room, cameras)
     tracked = track_points(room.surfaces, cameras, images, depths, rng)
     return Capture(_scene(cameras, images, tracked), images, depths, room, tracked.outliers)
