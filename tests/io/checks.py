@@ -56,7 +56,7 @@ READERS = {
     **dict.fromkeys(("a.bin", "a.npy", "a.npz", "a.pfm", "a.png", "a.tiff"), read_stored),
     "conf_0.png": read_confidence,
     "frame_00000.json": read_scanner_frame,
-    "camera.json": _read_camera,
+    "camera.json": lambda path: _read_camera(path, path.with_name("a.png")),
     "metadata.json": read_record3d,
     "odometry.csv": read_odometry,
     "camera_matrix.csv": _read_stray_camera,
