@@ -1,14 +1,14 @@
-"""What ``export --budget`` and ``--drop-isolated`` choose, against other rules: PSNR on test views.
+"""What ``export --budget`` and ``--drop-isolated`` choose, against other rules.
 
-python -m benchmarks.export_choices RUN ...
+Test views are taken out of each capture; of the rest every eighth is held out of training, and
+scored. Runs in the work folder are not trained again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import torch
@@ -16,7 +16,11 @@ import tyro
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
+import splatseed as ss
+from benchmarks.common.clouds import find_scenes
+from benchmarks.common.ledger import report
 from benchmarks.common.markdown import table
+from benchmarks.training.seeding_arms import TEST_EVERY
 from splatseed.photos.view import View
 from splatseed.sampling import evenly_spaced
 from splatseed.splat.formats import read_gaussians
@@ -40,8 +44,14 @@ NUM_FLOATERS = 200
 class Options:
     """Thin runs to budgets, and plant floaters in them."""
 
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Folders of finished runs."""
+    captures: tuple[str, ...] = ("fern", "fox", "face", "desk", "dorm", "stone_horse")
+    """Captures, by their names in the folder of captures."""
+    work: Path = Path("export_choices")
+    """Folder of their models."""
+    max_steps: int = 400
+    """Training steps."""
+    long_side: int = 300
+    """Longer side of the photographs, in pixels; a model has as many Gaussians as one has."""
     shares: tuple[float, ...] = (0.75, 0.5, 0.25)
     """Budgets, of the Gaussians."""
     views: int = 20
@@ -55,23 +65,43 @@ Importance = Float[np.ndarray, " N"]
 
 def main(options: Options) -> None:
     """Print both tables."""
-    thinned: dict[str, list[str]] = {}
+    lost: dict[str, list[tuple[float, ...]]] = {}
     cleaned = []
-    for run in options.runs:
+    for capture in options.captures:
+        run = _trained(find_scenes() / capture, options)
         path, config = model_file(run), config_of(run)
         gaussians = read_gaussians(path)
         found = model_views.find_model_views(path, gaussians, Path(config["scene"]), config)
         some = [found.train[i] for i in evenly_spaced(len(found.train), options.views)]
         views = found._replace(train=tuple(some))
-        for name, cells in _thinned(gaussians, views, options.shares).items():
-            thinned.setdefault(name, []).extend(cells)
+        for name, losses in _thinned(gaussians, views, options.shares).items():
+            lost.setdefault(name, []).append(losses)
         if options.floaters:
-            cleaned += [(run.name, *row) for row in _cleaned(gaussians, views)]
-    header = [f"{run.name}, {share:.0%}" for run in options.runs for share in options.shares]
-    print(table(("PSNR, dB", *header), [(name, *cells) for name, cells in thinned.items()]))
+            cleaned += [(capture, *row) for row in _cleaned(gaussians, views)]
+        report(f"  {capture}: {len(gaussians):,} Gaussians, {len(views.train)} training views")
+    header = [f"{share:.0%} of the Gaussians" for share in options.shares]
+    rows = [(name, *map(_mean_and_worst, zip(*each, strict=True))) for name, each in lost.items()]
+    print(table(("loss in dB: mean, worst", *header), rows))
     if cleaned:
         header = ["capture", "rule", "found", "wrong", "with floaters", "cleaned", "without any"]
         print("\n" + table(header, cleaned))
+
+
+def _trained(capture: Path, options: Options) -> Path:
+    """Train on a capture without its test views; return the folder of the run."""
+    run = options.work / f"{capture.name}_run"
+    if not run.exists():
+        scene, shown = ss.load_scene(capture), options.work / capture.name
+        ss.write_scene(scene.replace(images=scene.split(TEST_EVERY)[0]), shown, overwrite=True)
+        ss.train(
+            shown, run, strategy="grow", max_steps=options.max_steps,
+            long_side=options.long_side, budget="1rho",
+        )  # fmt: skip
+    return run
+
+
+def _mean_and_worst(losses: Sequence[float]) -> str:
+    return f"{np.mean(losses):.2f}, {max(losses):.2f}"
 
 
 def _scores(models: list[Gaussians], views: model_views.ModelViews) -> tuple[float, ...]:
@@ -80,8 +110,8 @@ def _scores(models: list[Gaussians], views: model_views.ModelViews) -> tuple[flo
 
 def _thinned(
     gaussians: Gaussians, views: model_views.ModelViews, shares: tuple[float, ...]
-) -> dict[str, list[str]]:
-    """Return PSNR by rule, for each budget."""
+) -> dict[str, tuple[float, ...]]:
+    """Return the loss in PSNR by rule, for each budget."""
     framed = views.frame.gaussians_from_world(gaussians)
     seen = [views.frame.view(view) for view in views.train]
     by_sum, by_max = _contributions(framed, seen)
@@ -94,7 +124,7 @@ def _thinned(
         "random": np.random.default_rng(0).random(len(gaussians)),
     }
     whole = _scores([gaussians, gaussians], views)[0]
-    cells = {"all Gaussians": [f"{whole:.2f}"] * len(shares)}
+    losses: dict[str, list[float]] = {}
     for share in shares:
         count = round(share * len(gaussians))
         keeps = {"need, in rounds": most_needed(gaussians, views, count, CPU)}
@@ -103,8 +133,8 @@ def _thinned(
         models.append(fit_sizes(models[0], gaussians, views, CPU)[0])
         names = [*keeps, "need, in rounds, sizes fitted: in use"]
         for name, score in zip(names, _scores(models, views), strict=True):
-            cells.setdefault(name, []).append(f"{score:.2f}")
-    return cells
+            losses.setdefault(name, []).append(whole - score)
+    return {name: tuple(each) for name, each in losses.items()}
 
 
 def _contributions(gaussians: Gaussians, views: list[View]) -> tuple[Importance, Importance]:

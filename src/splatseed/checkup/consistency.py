@@ -178,6 +178,7 @@ class Evidence:
         points: int = CONSISTENCY.points,
         photographs: int = CONSISTENCY.photographs,
         compared: Sequence[tuple[int, int]] | None = None,
+        by_color: bool = True,
         progress: Progress = silent,
     ) -> Fit:
         """Measure how points fit photographs if a hypothesis is true.
@@ -187,6 +188,7 @@ class Evidence:
             points: The maximum number per pair of views.
             photographs: How many, spread evenly, are compared with partners.
             compared: The pairs to compare instead.
+            by_color: Whether points without tracks are chosen by their colours.
             progress: Called with the stage and the fraction done.
         """
         if compared is None:
@@ -207,7 +209,7 @@ class Evidence:
             errors.append(np.abs(beneath[inside] - seen).mean(axis=1))
             others = np.roll(seen, len(seen) // 2, axis=0)
             unrelated.append(np.abs(beneath[inside] - others).mean(axis=1))
-            if self.has_colors and not self._seen.count:
+            if by_color and self.has_colors and not self._seen.count:
                 sample = self._alike((i, j), cameras, hypothesis.xyz, rows, points)
             pairs.append(self._fit_pair(i, j, cameras, hypothesis.xyz[sample]))
         return Fit(tuple(pairs), self._color_error(errors, unrelated))

@@ -71,7 +71,7 @@ def find_distortion(evidence: Evidence, fit: Fit, groups: Sequence[int]) -> Foun
     if not clear.any() and not (distorted and fit.support < DISTORTED.min_support):
         return None
     # Far from the centre, where distortion moves points most, their colours do not fit.
-    plain = _plain(evidence)
+    plain = evidence.fit(evidence.given, by_color=False)
     before = estimate_intrinsics_error(evidence, plain, evidence.given, groups)
     if distorted:
         lenses = [lens.pinhole for lens in given]
@@ -91,15 +91,6 @@ def find_distortion(evidence: Evidence, fit: Fit, groups: Sequence[int]) -> Foun
     if _clear(evidence.images, groups, after).any():
         return None
     return replace(found, radial=radial) if _fits(found) else None
-
-
-def _plain(evidence: Evidence) -> Fit:
-    """How points fit that are not chosen by their colours."""
-    colored, evidence.has_colors = evidence.has_colors, False
-    try:
-        return evidence.fit(evidence.given)
-    finally:
-        evidence.has_colors = colored
 
 
 def _clear(
@@ -136,7 +127,7 @@ def _with_lenses(
     pairs = zip(evidence.images, lenses, strict=True)
     images = [replace(image, intrinsics=lens) for image, lens in pairs]
     other = Evidence(evidence.scene, images)
-    without = _plain(other)
+    without = other.fit(other.given, by_color=False)
     after = estimate_intrinsics_error(other, without, other.given, groups)
     fit = other.fit(other.given)
     return FoundDistortion(None, fit, (plain, without), before.miss, after.miss), after

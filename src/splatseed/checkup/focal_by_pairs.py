@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatseed.checkup.focal_lengths import WRONG_FOCAL_LENGTH
-from splatseed.checkup.hypotheses import centering_factor
+from splatseed.checkup.hypotheses import centering_factor, peak
 from splatseed.checkup.pose_accuracy import MAX_EXACT, PoseErrorEstimate, estimate_focal_errors
 from splatseed.findings import Finding
 from splatseed.progress import Progress, silent
@@ -64,7 +64,7 @@ def find_focal_length(
         near = [(focal * step, 1.0) for step in SEARCH.fine_steps]
         errors |= estimate_focal_errors(scene, images, near, silent)
         known = [factors for factors in (best, *near) if factors in errors]
-        focal = _vertex([f for f, _ in known], [errors[factors] for factors in known])
+        focal = peak([f for f, _ in known], [-(errors[factors] ** 2) for factors in known])
         best = (focal, 1.0)
         errors |= estimate_focal_errors(scene, images, [best], silent)
     # Not ``error``, which may be that of other pairs.
@@ -86,13 +86,3 @@ def find_focal_length(
         fix += f", the principal point to {given.K[0, 2] * center:.5g}, "
         fix += f"{given.K[1, 2] * center:.5g}"
     return (Finding(WRONG_FOCAL_LENGTH, text, "error", fix=f"{fix}."),)
-
-
-def _vertex(factors: Sequence[float], errors: Sequence[float]) -> float:
-    """The factor at the vertex of a parabola through squared errors of nearby ones."""
-    best = factors[int(np.argmin(errors))]
-    if len(factors) < 3:
-        return best
-    bend, slope, _ = np.polyfit(np.log(factors), np.square(errors), 2)
-    vertex = np.exp(-slope / (2 * bend)) if bend > 0 else best
-    return float(np.clip(vertex, min(factors), max(factors)))

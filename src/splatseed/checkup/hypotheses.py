@@ -114,9 +114,21 @@ def _refined(evidence: Evidence, hypothesis: Hypothesis) -> Hypothesis:
     """Return the hypothesis at the vertex of a parabola through the scores of nearby factors."""
     factors = hypothesis.focal_factor * np.array(SEARCH.fine_steps)
     scores = [evidence.fit(replace(hypothesis, focal_factor=each)).score for each in factors]
+    return replace(hypothesis, focal_factor=peak(factors.tolist(), scores))
+
+
+def peak(factors: Sequence[float], scores: Sequence[float]) -> float:
+    """Return the factor at the vertex of a parabola through the scores of nearby factors.
+
+    It is the one with the highest score where the parabola has no peak, or there are fewer than
+    three.
+    """
+    best = factors[int(np.argmax(scores))]
+    if len(factors) < 3:
+        return best
     bend, slope, _ = np.polyfit(np.log(factors), scores, 2)
-    vertex = np.exp(-slope / (2 * bend)) if bend < 0 else factors[int(np.argmax(scores))]
-    return replace(hypothesis, focal_factor=float(np.clip(vertex, factors[0], factors[-1])))
+    vertex = np.exp(-slope / (2 * bend)) if bend < 0 else best
+    return float(np.clip(vertex, min(factors), max(factors)))
 
 
 def centering_factor(images: Sequence[Image]) -> float | None:

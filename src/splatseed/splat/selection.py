@@ -58,15 +58,20 @@ def parse_crop(text: str) -> Region:
         if radius > 0 and np.isfinite(center).all():
             return lambda xyz: np.asarray(np.linalg.norm(xyz - center, axis=1) <= radius)
     elif len(numbers or ()) in {12, 16} or (numbers is None and _is_file(text)):
-        box_from_world = np.linalg.inv(parse_matrix(text, "crop"))
-        rotation, shift = box_from_world[:3, :3], box_from_world[:3, 3]
-        return lambda xyz: np.asarray((np.abs(xyz @ rotation.T + shift) <= 0.5).all(axis=1))
+        return turned_box(parse_matrix(text, "crop"))
     raise ParameterError(
         "`crop=x0,y0,z0,x1,y1,z1`, the minimum and maximum corners of a box, x,y,z,r, the centre "
         "and radius of a sphere, or the matrix of a turned box",
         found=repr(text),
         fix="splatseed info SCENE prints the bounding box of the points.",
     )
+
+
+def turned_box(world_from_cube: Float64[np.ndarray, "4 4"]) -> Region:
+    """Return the box that an invertible matrix makes of the cube of side 1 around 0."""
+    cube_from_world = np.linalg.inv(world_from_cube)
+    turn, shift = cube_from_world[:3, :3], cube_from_world[:3, 3]
+    return lambda xyz: np.asarray((np.abs(xyz @ turn.T + shift) <= 0.5).all(axis=1))
 
 
 def _is_file(text: str) -> bool:

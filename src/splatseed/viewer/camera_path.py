@@ -13,10 +13,10 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from splatseed.errors import SceneFormatError
@@ -30,6 +30,7 @@ from splatseed.sampling import evenly_spaced
 from splatseed.scene import Color
 from splatseed.similarity import Similarity
 from splatseed.splat.gaussians import Gaussians
+from splatseed.splat.selection import Region, turned_box
 from splatseed.text import agreeing, counted
 from splatseed.viewer.models import pinhole_view
 
@@ -57,19 +58,11 @@ class _PathCheck:
 CHECK = _PathCheck()
 
 
-@dataclass(frozen=True, eq=False)
-class CropBox:
-    """The part of the model that a path shows: a box, turned, in the path's world."""
+class Crop(NamedTuple):
+    """The part of the model that a path shows."""
 
-    center: Float64[np.ndarray, " 3"]
-    sides: Float64[np.ndarray, " 3"]  # whole lengths
-    rotation: Float64[np.ndarray, "3 3"]  # world_from_box
+    contains: Region  # of positions in the path's world
     background: Color  # of empty pixels
-
-    def contains(self, xyz: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
-        """Whether positions in the path's world are inside."""
-        offsets = (np.asarray(xyz, np.float64) - self.center) @ self.rotation
-        return np.asarray((np.abs(offsets) < self.sides / 2).all(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +74,7 @@ class CameraPath:
     fovs: tuple[float, ...]  # vertical, radians
     fps: float | None  # frames per second; None: the file does not say
     size: tuple[int, int] | None  # width and height that it is made for
-    crop: CropBox | None
+    crop: Crop | None
     shapes: tuple[float, ...] = ()  # width / height that frames state
     timed: bool = False  # frames state different times
 
@@ -243,7 +236,7 @@ def _size(content: Mapping[str, Any]) -> tuple[int, int] | None:
     return size
 
 
-def _crop(crop: Mapping[str, Any]) -> CropBox:
+def _crop(crop: Mapping[str, Any]) -> Crop:
     turn = crop.get("crop_rot") or (0.0, 0.0, 0.0)  # roll, pitch and yaw, radians
     center, sides, angles = (
         np.array(each, np.float64).reshape(3)
@@ -254,6 +247,8 @@ def _crop(crop: Mapping[str, Any]) -> CropBox:
     numbers = np.concatenate([center, sides, angles, background])
     if not np.isfinite(numbers).all() or not (sides > 0).all():
         raise ValueError(f"a crop box of {sides.tolist()} at {center.tolist()}")
-    rotation = Rotation.from_euler("xyz", angles).as_matrix()  # yaw @ pitch @ roll
+    box = np.eye(4)
+    box[:3, :3] = Rotation.from_euler("xyz", angles).as_matrix() * sides  # yaw @ pitch @ roll
+    box[:3, 3] = center
     red, green, blue = np.clip(np.rint(background), 0, 255).astype(int).tolist()
-    return CropBox(center, sides, rotation, (red, green, blue))
+    return Crop(turned_box(box), (red, green, blue))
