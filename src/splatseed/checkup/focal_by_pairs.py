@@ -72,7 +72,7 @@ def find_focal_length(
     limit = SEARCH.max_px if before is None else SEARCH.max_error * before
     if after > min(limit, SEARCH.max_px) or abs(focal - 1) < SEARCH.min_change:
         return ()
-    missed = "at too few places to tell" if before is None else f"by about {before:.2g} px"
+    missed = "at too few places to measure" if before is None else f"by about {before:.2g} px"
     given = images[0].intrinsics
     what = "focal lengths" if center == 1.0 else "focal lengths and principal points"
     text = (

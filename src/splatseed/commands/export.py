@@ -204,7 +204,7 @@ def _views(job: _Job, gaussians: Gaussians, progress: Progress, note: Note) -> M
 def _kept(
     job: _Job, gaussians: Gaussians, views: ModelViews | None, progress: Progress
 ) -> tuple[Gaussians, list[tuple[str, str]]]:
-    """Choose the Gaussians to write; also return rows that tell what was left out."""
+    """Choose the Gaussians to write; also return rows on what was left out."""
     options, rows = job.options, list[tuple[str, str]]()
     # What leaves nothing is refused before photographs are compared.
     keep = kept_by_filter(gaussians, job.crop, options.min_opacity)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for i
     from splatseed.viewer.cameras import GivenCameras
     from splatseed.viewer.models import ViewerItem
 
-DEFAULT_SIDE = 1280  # longer side at most, unless --size or a path's file asks for more
+DEFAULT_SIDE = 1280  # longer side at most, unless --size or a path's file sets another
 MIN_SIDE, MAX_SIDE = 16, 8192
 MAX_FRAMES = 20_000
 FPS, SECONDS = 30.0, 10.0
@@ -214,7 +214,7 @@ def _open_models(options: Options) -> list[ViewerItem]:
     return items
 
 
-def _asked_size(options: Options) -> tuple[int, int] | None:
+def _chosen_size(options: Options) -> tuple[int, int] | None:
     if options.size is None:
         return None
     sides = options.size.lower().split("x")
@@ -234,22 +234,22 @@ def _flight(options: Options, item: ViewerItem) -> _Flight:
     from splatseed.viewer.cameras import GivenCameras, read_cameras
     from splatseed.viewer.videos import even_size
 
-    asked, cameras = _asked_size(options), item.central_views
+    chosen, cameras = _chosen_size(options), item.central_views
     size = next((even_size(v.width, v.height, DEFAULT_SIDE) for v in cameras), WITHOUT_CAMERAS)
     if options.cameras is not None:
         given = read_cameras(options.cameras, item.scene)
         sizes = {(view.width, view.height) for view in given.views}
         refuse(
-            (options.is_video and asked is None and len(sizes) > 1,
+            (options.is_video and chosen is None and len(sizes) > 1,
              "cameras of one size, for a video", f"{len(sizes)} sizes",
              "Write pictures (-o FOLDER), or pass --size."),
         )  # fmt: skip
-        size = asked or min(sizes)
+        size = chosen or min(sizes)
     elif options.file is not None:
         path = read_camera_path(options.file)
-        size = asked or path.size or size
+        size = chosen or path.size or size
         given = GivenCameras(tuple(path.views(size)), of_scene=False, path=path)
-    size = even_size(*(asked or size)) if options.is_video else asked or size
+    size = even_size(*(chosen or size)) if options.is_video else chosen or size
     if options.file is None:
         frames = max(1, round((options.seconds or SECONDS) * FPS))
         if options.path == ORBIT or len(cameras) < 2:

@@ -8,9 +8,9 @@ densification, 0.24 on average, and -0.30 to 0.28 under strategy ``grow``, -0.02
 quarter of a Gaussian per pixel; with one per pixel 0.27 and 0.28 on average, the latter from one
 capture (dorm, 1.27; the others at most 0.24). Where its points alone filled the budget (bonsai,
 treehill), adding points cost up to 0.4 dB. Under ``grow`` the share of the pictures' cells without
-a point tells dorm from the others: below ``MAX_BARE`` ``auto`` gained -0.28 to 0.24 dB, above it
--0.15 to 1.27, and up to 2.7 in short runs. That predicts nothing for another capture, so advice
-gives no gain.
+a point distinguishes dorm from the others: below ``MAX_BARE`` ``auto`` gained -0.28 to 0.24 dB,
+above it -0.15 to 1.27, and up to 2.7 in short runs. That predicts nothing for another capture, so
+advice gives no gain.
 """
 
 from __future__ import annotations

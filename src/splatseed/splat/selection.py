@@ -32,7 +32,7 @@ class IsolationSettings:
 ISOLATION = IsolationSettings()
 
 Region: TypeAlias = Callable[[Float[np.ndarray, "N 3"]], Bool[np.ndarray, " N"]]
-"""A function that tells which positions lie in a region."""
+"""Maps positions to whether they lie in a region."""
 
 
 def parse_crop(text: str) -> Region:

@@ -105,7 +105,7 @@ class CameraPath:
         return gaussians.select(inside)
 
     def findings(self, size: tuple[int, int], inside: int, total: int) -> list[Finding]:
-        """Say how frames of a size differ from what the path asks for.
+        """Say how frames of a size differ from those of the path.
 
         ``inside`` of ``total`` Gaussians are in the crop box.
         """

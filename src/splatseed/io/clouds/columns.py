@@ -23,7 +23,7 @@ _BYTE, _WIDE, _LABEL = 255, 65535, 31
 """Largest integers of 8 and 16 bits, and of labels: LAS has classes of 5 bits."""
 _ALIKE = ({"byte", "bit"}, {"unit", "bit"}, {"wide"})
 _MIN_ROWS = 100
-"""Rows from which on columns can be told apart by statistics."""
+"""Minimum number of rows whose statistics distinguish columns."""
 _FEW, _PER_ROW = 16, 8
 """Most values of a column of labels: so many, and one for so many rows."""
 _IN_ORDER = 0.98

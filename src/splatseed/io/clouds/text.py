@@ -1,9 +1,9 @@
 """Text clouds (XYZ, CSV, TXT, ASC, PTS): one point per line, with any delimiter.
 
 Delimiter, decimal comma and header line are detected from the first lines. Without a header, rows
-from the whole file tell what columns are (``columns``), unless the caller does; ``findings`` report
-the guess. PTS files have intensity before colours, and before each of their scans a line with the
-number of its points.
+from the whole file decide what columns are (``columns``), unless the caller names them;
+``findings`` report the guess. PTS files have intensity before colours, and before each of their
+scans a line with the number of its points.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def _guessed(path: Path, offset: int, dialect: Dialect, count: int, *, is_pts: b
         others = others[-1:]
         places = [names.index(RGB[0]) + 1 for names in (first, *others)]
         raise SceneFormatError(
-            f"{path} to tell which of its {count} columns are red, green, blue",
+            f"{path} to show which of its {count} columns are red, green, blue",
             found=" or ".join(f"{at} to {at + 2}" for at in places) + ", which look alike",
             fix=f"{_fix(first, 'Pass')[:-1]} or {_columns(*others)}, whichever is right.",
         )

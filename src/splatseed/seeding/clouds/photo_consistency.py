@@ -304,7 +304,7 @@ def consistent_voxels(
 def _uncolored(
     colors: UInt8[np.ndarray, "N 3"], has_color: Bool[np.ndarray, " N"], evidence: Evidence
 ) -> Bool[np.ndarray, " N"]:
-    """Tell of which voxels a cloud has no colour.
+    """Find the voxels of which a cloud has no colour.
 
     These are black, or have one colour in common that the photographs contradict: some writers fill
     in white or grey where the scanner saw none.
@@ -327,7 +327,7 @@ def _compare_colors(
 ) -> tuple[Float64[np.ndarray, " N"], float]:
     """Return how far colours are from the photographs', and the median of the ``known`` ones.
 
-    NaN where photographs do not tell; the median is infinite if they do nowhere.
+    NaN where photographs show nothing; the median is infinite if they do nowhere.
     """
     difference = np.abs(colors.astype(np.int16) - evidence.rgb).max(axis=1).astype(np.float64)
     difference[np.isnan(evidence.agreement)] = np.nan
@@ -338,9 +338,9 @@ def _compare_colors(
 def _contradicted(
     evidence: Evidence, colors: UInt8[np.ndarray, "N 3"] | None, colored: Bool[np.ndarray, " N"]
 ) -> tuple[Bool[np.ndarray, " N"], dict[str, int]]:
-    """Tell which voxels are contradicted, and count them by their first reason.
+    """Find the voxels that photographs contradict, and count them by their first reason.
 
-    ``colored`` tells of which the cloud has a colour.
+    ``colored``: those of which the cloud has a colour.
     """
     s = CONSISTENCY
     violation = evidence.free_space_violation
