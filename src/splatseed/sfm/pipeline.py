@@ -302,7 +302,7 @@ def refined(
     """
     require("pycolmap")
     folder, own = photograph_folder(scene).absolute(), len(scene.points)
-    test = scene.split(test_every)[1] if test_every or scene.listed else ()
+    test = scene.split(test_every)[1]
     photos, _ = find_photos(folder)
     poses = match_poses(photos, scene, folder)
     with TemporaryDirectory(prefix="splatseed-refine-") as name:
