@@ -21,6 +21,7 @@ from typing import NamedTuple, TypeAlias
 
 from PIL import Image as PilImage
 
+from splatseed.findings import Finding
 from splatseed.text import agreeing, counted, name_some
 
 Size = tuple[int, int]
@@ -36,6 +37,12 @@ _NEAR_RATIO = 1.06
 """The same if either has few photographs."""
 _MIN_GROUP = 4
 """Fewest photographs for a separate camera."""
+
+
+MIN_DISTORTION = 12
+"""Fewest photographs of which distortion is estimated, by default."""
+MIN_FOCAL = 6
+"""Fewest of which a focal length that EXIF names is estimated, too."""
 
 
 class Exif(NamedTuple):
@@ -109,6 +116,19 @@ def share_cameras(photos: Photos) -> tuple[SharedCamera, ...]:
                 groups += _by_folder(setting)
     groups = sorted(map(sorted, _merge_without_exif(groups, photos)))
     return tuple(_shared(names, photos, lengths) for names in groups)
+
+
+def default_model(count: int) -> str:
+    """Return COLMAP's camera model for a number of photographs: without distortion for few."""
+    return "OPENCV" if count >= MIN_DISTORTION else "SIMPLE_PINHOLE"
+
+
+def held_lens(count: int, *, focal: bool) -> Finding:
+    """Return the finding that few photographs do not determine the lens."""
+    what = "the focal length is EXIF's" if focal else "only the focal length is estimated"
+    text = f"{count} photographs do not determine a lens: it is taken to have no distortion, and "
+    fix = "With `camera_model='OPENCV'` all is estimated; with more photographs by default."
+    return Finding("held-lens", f"{text}{what}.", "info", fix=fix)
 
 
 def describe_cameras(cameras: Sequence[SharedCamera]) -> str:
