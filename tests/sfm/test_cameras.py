@@ -6,15 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from splatseed.sfm.cameras import (
-    MIN_DISTORTION,
-    Exif,
-    Photo,
-    default_model,
-    describe_cameras,
-    read_exif,
-    share_cameras,
-)
+from splatseed.sfm.cameras import Exif, Photo, describe_cameras, read_exif, share_cameras
 
 SIZE = (4000, 3000)
 

@@ -15,8 +15,8 @@ from splatseed.training import trainer
 from splatseed.training.api import prepare_training
 from splatseed.training.folder import config_of
 from splatseed.training.model_views import find_model_views
-from splatseed.training.request import TrainRequest
 from splatseed.training.parameters import DROPPED, as_parameters, with_dropout
+from splatseed.training.request import TrainRequest
 from splatseed.training.schedule import make_schedule
 from splatseed.training.traits import STRATEGIES
 
@@ -96,6 +96,7 @@ def test_all_of_few_photographs_are_trained_on_and_nothing_is_scored(room_path, 
     assert (len(views.train), views.label) == (9, "training view")
     loss = RenderLoss(3, (30.0, 29.0), (40.0,), views.label).finding(".sog")
     assert "(3 training views)" in loss.text
+
 
 def test_photographs_are_held_out_where_the_user_or_the_scene_says_so(room, tmp_path):
     def begun(scene, **options):

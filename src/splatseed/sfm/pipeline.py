@@ -81,7 +81,7 @@ class SfmReport:
     refinement: Refinement | None = None  # None without ``refine_poses``
     poses: tuple[Image, ...] = ()  # the known poses, refined with ``refine_poses``
     num_pairs: int = 0  # matched pairs of photographs
-    findings: tuple[Finding, ...] = ()  # poses that may be wrong, or were not refined
+    findings: tuple[Finding, ...] = ()  # a lens held, poses that may be wrong or were not refined
 
 
 Job: TypeAlias = Callable[..., Any]
