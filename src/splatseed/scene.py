@@ -40,7 +40,10 @@ OPENGL = "with OpenGL's camera axes (x right, y up, z back)"
 TEST_EVERY = 8
 """By default every 8th image by name tests, from the first."""
 MIN_HELD_OUT = 12
-"""Fewest images of which ``train`` holds some out unless asked to."""
+"""Fewest images of which ``train`` holds some out by default. PSNR rises by about 4 dB where
+photographs double, in published tables (3 to 6 of LLFF: 20.4 to 24.5; 12 to 24 of Mip-NeRF360: 19.5
+to 23.4). So to hold out every 8th costs about 2 dB with 3 photographs and 1 with 6 to 11, for a
+score that rests on one or two of them."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -127,7 +127,7 @@ def held_lens(count: int, *, focal: bool) -> Finding:
     """Return the finding that few photographs do not determine the lens."""
     what = "the focal length is EXIF's" if focal else "only the focal length is estimated"
     text = f"{count} photographs do not determine a lens: it is taken to have no distortion, and "
-    fix = "With `camera_model='OPENCV'` all is estimated; with more photographs by default."
+    fix = f"`camera_model='OPENCV'` estimates all of it, the default from {MIN_DISTORTION} on."
     return Finding("held-lens", f"{text}{what}.", "info", fix=fix)
 
 
