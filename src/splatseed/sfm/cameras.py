@@ -39,10 +39,14 @@ _MIN_GROUP = 4
 """Fewest photographs for a separate camera."""
 
 
-MIN_DISTORTION = 12
-"""Fewest photographs of which distortion is estimated, by default."""
+MIN_DISTORTION = 16
+"""Fewest photographs of which distortion is estimated, by default. Of undistorted captures, OPENCV
+fits distortion that displaces a corner by 3.2% of the width with 3 photographs (median of nine), 1.6%
+with 6, 0.9% with 9, 1.1% with 12 and 0.9% with 16, as much as a phone's lens or more. Without it
+focal lengths are nearer, and of lenses that displace corners by 1% poses are as exact with 6."""
 MIN_FOCAL = 6
-"""Fewest of which a focal length that EXIF names is estimated, too."""
+"""Fewest of which a focal length that EXIF has is estimated, too: without distortion it is off by 1.9%
+with 3 photographs and 1.2% with 6 (medians), but by up to 16% with 3 and 4; EXIF's is by a few."""
 
 
 class Exif(NamedTuple):
