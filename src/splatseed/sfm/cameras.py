@@ -40,13 +40,13 @@ _MIN_GROUP = 4
 
 
 MIN_DISTORTION = 16
-"""Fewest photographs of which distortion is estimated, by default. Of undistorted captures, OPENCV
-fits distortion that displaces a corner by 3.2% of the width with 3 photographs (median of nine), 1.6%
-with 6, 0.9% with 9, 1.1% with 12 and 0.9% with 16, as much as a phone's lens or more. Without it
-focal lengths are nearer, and of lenses that displace corners by 1% poses are as exact with 6."""
+"""Fewest photographs of which distortion is estimated, by default. Of captures without distortion,
+OPENCV fits some that displaces corners by 3.2% of the width with 3 photographs, 1.6% with 6, 0.9%
+with 9, 1.1% with 12 and 0.9% with 16 (medians of nine captures, then fewer), as much as a phone's
+lens or more (docs/few_photographs.md)."""
 MIN_FOCAL = 6
-"""Fewest of which a focal length that EXIF has is estimated, too: without distortion it is off by 1.9%
-with 3 photographs and 1.2% with 6 (medians), but by up to 16% with 3 and 4; EXIF's is by a few."""
+"""Fewest of which a focal length that EXIF has is estimated all the same: without distortion it is
+off by 1.9% with 3 photographs and 1.2% with 6 (medians), but on fern by 16% with 3 and 4."""
 
 
 class Exif(NamedTuple):
