@@ -360,8 +360,9 @@ def _print_next(job: _Job) -> None:
         print_pairs("next", [("open it in a browser, here or wherever you send it", link)])
         return
     rows = [("look at it", f"splatseed view {quoted(options.output)}")]
-    # Of a run that held nothing out there is nothing to score; moved Gaussians have no scene.
-    if job.transform is None and job.config.get("test_every") != 0:
+    split = job.config.get("split")
+    unscored = isinstance(split, dict) and not split.get("test")  # nothing was held out
+    if job.transform is None and not unscored:  # moved, its scene is elsewhere
         rows.append(("score it", _scoring_command(job)))
     print_pairs("next", rows)
 
