@@ -297,3 +297,5 @@ def test_budgets_leave_uncapped_strategies_alone():
     assert len(free) == len(equal) == 1 + 5 * 3 * 2 + 3  # sfm, methods, and random's one profile
     with pytest.raises(ParameterError, match="at least one of ratios"):
         dataclasses.replace(plan, ratios=())
+    with pytest.raises(ParameterError, match="test views to compare by"):
+        dataclasses.replace(plan, training=TrainSettings(test_every=0))

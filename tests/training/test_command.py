@@ -35,7 +35,7 @@ def _json(path):
 
 def test_trains_by_the_best_strategy_and_says_what_and_where(room_path, tmp_path, capsys):
     run = tmp_path / "run"
-    words = (room_path, "--max-steps", "3", "--long-side", "48", "-o", run)
+    words = (room_path, "--max-steps", "3", "--long-side", "48", "--test-every", "8", "-o", run)
     assert _run(*words) == 0
     said = capsys.readouterr()
     size = "rho of 48 x 36 pixels"

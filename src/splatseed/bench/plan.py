@@ -302,6 +302,7 @@ class Plan:
             (long_side is None or long_side >= _MIN_SIDE,
              f"long_side of {_MIN_SIDE} or more", long_side),
             (long_side is None or training.factor == 1, "long_side or data_factor", "both"),
+            (training.test_every, "test views to compare by (test_every of 2 or more)", "none"),
             (self.repeats >= 1, "repeats of 1 or more", self.repeats),
         ):  # fmt: skip
             if not valid:

@@ -314,7 +314,7 @@ def _loss(
         frame = frame_of_model(around, NO_POINTS, models[0])
         return measure_loss(models, around, frame, device, progress)
     test = [replace(view, photograph=NO_PIXELS) if cropped else view for view in views.test]
-    return measure_loss(models, test, views.frame, device, progress, views.background)
+    return measure_loss(models, test, views.frame, device, progress, views.background, views.label)
 
 
 def _loss_rows(
@@ -325,7 +325,7 @@ def _loss_rows(
         return []
     if loss.scores:
         scores = ", ".join(f"{n} {x:.2f} dB" for n, x in zip(stages, loss.scores, strict=True))
-        return [("score", f"{scores}; PSNR, {counted(loss.views, 'test view')}")]
+        return [("score", f"{scores}; PSNR, {counted(loss.views, loss.label)}")]
     where = "around it" if views is None else "of its scene"
     alike = ", ".join(
         f"{name} {x:.1f} dB"
@@ -360,7 +360,9 @@ def _print_next(job: _Job) -> None:
         print_pairs("next", [("open it in a browser, here or wherever you send it", link)])
         return
     rows = [("look at it", f"splatseed view {quoted(options.output)}")]
-    if job.transform is None:  # else its scene is elsewhere
+    split = job.config.get("split")
+    unscored = isinstance(split, dict) and not split.get("test")  # nothing was held out
+    if job.transform is None and not unscored:  # moved, its scene is elsewhere
         rows.append(("score it", _scoring_command(job)))
     print_pairs("next", rows)
 

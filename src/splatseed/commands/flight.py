@@ -166,7 +166,10 @@ def run(arguments: list[str]) -> None:
     if path is not None:
         size = views[0].width, views[0].height
         print_note(*path.findings(size, len(models[0]), len(items[0].model)))
-    print_note(*videos.unseen_findings(shown, names))
+    print_note(
+        *videos.unseen_findings(shown, names),
+        *videos.guessed_findings(renderers[0], views, items[0].train_views),
+    )
     if items[0].moved and flight.given and not flight.given.of_scene and options.transform is None:
         text = f"{options.file} is taken to be in the model's frame, too, and was transformed with "
         text += "it; for the scene's frame, pass --transform none."

@@ -340,7 +340,7 @@ def _next(
 
 def _facts_of(scene: Scene) -> dict[str, Any]:
     """Return the source and the contents of a scene, for ``--json``."""
-    train, test = scene.split()
+    train, test = scene.split(scene.default_test_every)
     return {
         "format": scene.source.format,
         "root": str(scene.source.root),
@@ -386,7 +386,7 @@ def _source_rows(scene: Scene) -> list[tuple[str, str]]:
     cameras = [f"{count:,} {kind}" for kind, count in sizes.most_common(KINDS_SHOWN)]
     if len(sizes) > KINDS_SHOWN:
         cameras.append(f"{len(sizes) - KINDS_SHOWN:,} more kinds")
-    train, test = scene.split()
+    train, test = scene.split(scene.default_test_every)
     by = f", by its {scene.listed.origin}" if scene.listed else ""
     images = f"{len(scene.images):,} ({len(train):,} to train, {len(test):,} to test{by})"
     return [

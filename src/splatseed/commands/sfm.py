@@ -55,8 +55,9 @@ class Options:
     or the pairs that a first look at few features finds to overlap (auto)."""
     frames: int = 150
     """Maximum frames from a video."""
-    camera_model: str = "OPENCV"
-    """COLMAP's camera model; not used with --poses-from."""
+    camera_model: str | None = None
+    """COLMAP's camera model; not used with --poses-from. By default OPENCV, and SIMPLE_PINHOLE,
+    which has no distortion, with fewer than 16 photographs."""
     shared_camera: bool = True
     """Photographs of the same size and EXIF lens share a camera; not used with --poses-from."""
     device: DeviceName = "auto"

@@ -196,9 +196,10 @@ def _announce(options: Options, training: TrainingRun) -> None:
         print_note(Finding("unused-setting", text))
     chosen = settings.strategy == DEFAULTS.strategy
     strategy = f"{settings.traits.name} ({settings.strategy})" if chosen else settings.strategy
+    tests = len(training.trainer.test_views)
+    parts = f"{len(views)} training and {tests} test views" if tests else f"{len(views)} views"
     OUT.print(
-        f"{visible(options.scene)} ({len(views)} training and {len(training.trainer.test_views)} "
-        f"test views of {views[0].width} x {views[0].height}, "
+        f"{visible(options.scene)} ({parts} of {views[0].width} x {views[0].height}, "
         f"{len(training.state.params['means']):,} Gaussians)\n  -> strategy {strategy}, "
         f"{settings.max_steps:,} steps, seed {settings.seed}, on {training.device}\n  -> "
         f"{visible(options.output)}",
@@ -329,28 +330,32 @@ def _summarise(options: Options, training: TrainingRun, result: TrainingResult) 
     scores, seconds, output = result.scores, result.train_seconds, options.output
     exposed = training.settings.exposure != "none"
     psnr = f"{scores.psnr:.2f} dB" if math.isfinite(scores.psnr) else "infinite"
-    rows = [
+    scored = [
         ("test PSNR", psnr),
         *[("colour-corrected", f"{scores.cc_psnr or 0.0:.2f} dB")] * exposed,
         ("test SSIM, FLIP", f"{scores.ssim:.4f}, {scores.flip or 0.0:.4f}"),
+    ]
+    pictures = [str(output / "renders")] if scores.per_image else []
+    rows = [
+        *(scored if scores.per_image else [("score", "none, as no photograph was held out")]),
         ("Gaussians", f"{scores.num_gaussians:,} from {result.num_seeds:,} seeds"),
         ("training", f"{seconds:.1f} s for {result.steps:,} steps"),
         ("Gaussians in", str(training.folder.gaussians)),
-        ("pictures", f"{output / 'renders'}, {output / 'curve.png'}"),
+        ("pictures", ", ".join([*pictures, str(output / "curve.png")])),
     ]
     print_pairs("splatseed train", rows)
     if held := result.held_by_memory_at:
         text = f"memory limited the run to {held:,} Gaussians; results may vary between machines."
         fix = f"Pass --budget {held} for the same result everywhere."
         print_note(Finding("memory-limit", text, fix=fix))
-    print_pairs("next", _next_commands(output))
+    print_pairs("next", _next_commands(output, scored=bool(scores.per_image)))
 
 
-def _next_commands(output: Path) -> list[tuple[str, str]]:
+def _next_commands(output: Path, *, scored: bool) -> list[tuple[str, str]]:
     """Return the commands for a finished run; LPIPS only where its weights are."""
     from splatseed.splat.lpips import has_lpips_weights
 
     view = ("look at it", f"splatseed view {quoted(output)}")
     share = ("share it", f"splatseed export {quoted(output)} -o {quoted(f'{output}.html')}")
     score = ("score again, with LPIPS", f"splatseed evaluate {quoted(output)}")
-    return [view, share, *[score] * has_lpips_weights()]
+    return [view, share, *[score] * (scored and has_lpips_weights())]

@@ -27,7 +27,7 @@ from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.view import View, camera_views, view_of
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.requirements import require
-from splatseed.scene import Image, Scene
+from splatseed.scene import MIN_HELD_OUT, Image, Scene
 from splatseed.scores import EvalResult
 from splatseed.seeding.budget import in_rho, median_pixels, median_size, parse_budget
 from splatseed.settings import change_settings
@@ -79,7 +79,7 @@ class Run:
         """Scores of the test views and the run's numbers (metrics.json).
 
         ``psnr`` and ``cc_psnr`` in dB, ``ssim``, ``flip``, ``num_gaussians``, ``train_seconds``,
-        ``per_image``, ...
+        ``per_image``, ...; scores are None if no photograph was held out.
         """
         content: dict[str, Any] = json.loads(read_text(RunFolder(self.folder).metrics))
         return content
@@ -120,7 +120,7 @@ def train(
     progress: Progress = silent,
     **options: Any,
 ) -> Run:
-    """Train Gaussians on a scene and score them on its test views.
+    """Train Gaussians on a scene and score them on its test views, which few photographs lack.
 
     Args:
         scene: A scene with photographs, or its path. Its points are the seeds; where they are not
@@ -178,6 +178,8 @@ def prepare_training(
         note(finding)
     if scene.listed is not None:
         note(Finding("listed-split", scene.listed.sentence, "info"))
+    if resumed is None and "test_every" not in request.named:
+        settings = _with_default_split(settings, scene, note)
     settings = _sized(settings, scene, request.long_side, resumed, note)
     settings = _within_budget(settings, request.budget, scene, note)
     if settings.seeding == "auto" and (why := no_seeding_reason(scene, settings)):
@@ -244,6 +246,18 @@ def _named_settings(request: TrainRequest, *, resumes: bool) -> TrainSettings:
         other = "refine_poses" if request.refine_poses else "seeding"
         raise ParameterError(f"`start` or `{other}`", found="both", fix="Leave one out.")
     return dataclasses.replace(settings, start=str(model_file(Path(settings.start)).resolve()))
+
+
+def _with_default_split(settings: TrainSettings, scene: Scene, note: Note) -> TrainSettings:
+    """The settings, with nothing held out of few photographs, unless the scene lists tests."""
+    chosen = scene.listed is not None or settings.test_every != TrainSettings.test_every
+    if chosen or scene.default_test_every == settings.test_every or not scene.images:
+        return settings
+    text = f"All {len(scene.images)} photographs are trained on: of fewer than {MIN_HELD_OUT}, "
+    text += "none is held out by default, so nothing is scored on unseen photographs."
+    fix = f"`test_every={settings.test_every}` holds some out, or list them (docs/formats.md)."
+    note(Finding("nothing-held-out", text, "info", fix=fix))
+    return dataclasses.replace(settings, test_every=scene.default_test_every)
 
 
 def _sized(

@@ -30,13 +30,14 @@ from splatseed.similarity import Similarity
 from splatseed.splat.background import background_of
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.model_frame import scene_from_model, translate_gaussians, view_in_model_frame
+from splatseed.splat.render_loss import TEST_VIEW
 from splatseed.splat.training_frame import TrainingFrame, frame_of_model
 from splatseed.training.config import has_run_poses
 from splatseed.training.settings import TrainSettings
 
 NO_CONFIG: Mapping[str, Any] = MappingProxyType({})
 MAX_COMPARED = 6
-"""Test views from which a model before and after a change is rendered."""
+"""Views from which a model before and after a change is rendered."""
 
 
 class ModelViews(NamedTuple):
@@ -45,11 +46,14 @@ class ModelViews(NamedTuple):
     train: tuple[View, ...]
     """Training views; without photographs, with masks."""
     test: tuple[View, ...]
-    """Some of the test views; with their photographs, if the scene has them."""
+    """Some of the test views, or of the training views if nothing was held out; with their
+    photographs, if the scene has them."""
     frame: TrainingFrame
     """To render in."""
     background: Color = BLACK
     """Behind renders, and behind transparent pixels of the photographs."""
+    label: str = TEST_VIEW
+    """What the views in ``test`` are."""
 
 
 def find_model_views(
@@ -81,7 +85,7 @@ def find_model_views(
     with suppress(SceneNotFoundError):
         scene, photographed = with_photographs(scene), True
     every = config.get("test_every")
-    every = every if isinstance(every, int) and every > 1 else TrainSettings.test_every
+    every = every if isinstance(every, int) and every != 1 else TrainSettings.test_every
     train, test = scene.split(every)
     if not train:
         raise SceneNotFoundError(
@@ -111,6 +115,7 @@ def find_model_views(
         views_of(compared, pixels=True),
         frame_of_model(views, points if world is None else world.points(points), gaussians),
         scene.background,
+        TEST_VIEW if test else "training view",
     )
 
 
