@@ -28,7 +28,6 @@ from splatseed.cli import main
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.io.ply import write_ply
-from splatseed.requirements import version_of
 from splatseed.splat.covisible import read_covisible
 from splatseed.splat.pictures import BAND
 from splatseed.training.seeds import seeds_digest
@@ -46,7 +45,7 @@ def specs(small_plan, room_path):
         training=dataclasses.replace(small_plan.training, max_steps=4),
     )
     facts = surveyed(room_path, with_depth=True)
-    runs = plan_runs(plan, [facts], "cpu", version_of("splatseed") or "")
+    runs = plan_runs(plan, [facts], "cpu")
     return {run.arm.method: run for run in runs}
 
 
@@ -105,7 +104,7 @@ def test_seeds_are_those_that_the_command_writes(small_plan, own_room, room_of, 
     np.savez(scan, xyz=surfaces.sample(20_000, np.random.default_rng(2)))
     facts = surveyed(own_room, cloud=scan, with_depth=True)
     plan = dataclasses.replace(small_plan, methods=(method,), repeats=1)
-    (spec,) = plan_runs(plan, [facts], "cpu", "1")
+    (spec,) = plan_runs(plan, [facts], "cpu")
     seeds, seconds = make_seeds(open_unchanged(spec.scene), spec)
     files = {"DEPTH": spec.scene.depth, "SCAN": str(scan)}
     words = [files.get(word, word) for word in COMMANDS[method]]
@@ -122,7 +121,7 @@ def _budgeted(small_plan, room_path, method, budget, strategy="none"):
         small_plan, methods=(method,), ratios=(), budgets=(budget,), repeats=1,
         strategies=(strategy,),
     )  # fmt: skip
-    (spec,) = plan_runs(plan, [surveyed(room_path)], "cpu", "1")
+    (spec,) = plan_runs(plan, [surveyed(room_path)], "cpu")
     return spec
 
 

@@ -149,7 +149,7 @@ def test_the_commands_say_what_they_found(tmp_path, capsys, blank_figures):
     bench = write_bench(tmp_path / "b", runs(**ONE))
     main(["bench", "report", str(bench)])
     output = " ".join(capsys.readouterr().out.split())
-    assert "On 1 scene, mls 8x + none is best" in output
+    assert "On 1 scene, mls 8x + none has the highest mean" in output
     assert str(bench / REPORT) in output
     with pytest.raises(SystemExit) as stop:
         main(["bench", "report", str(tmp_path / "nowhere")])

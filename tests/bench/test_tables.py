@@ -247,7 +247,9 @@ def test_the_answer_names_the_worst_scene_and_the_seconds():
     finished = [
         run
         for scene, gain in planted.items()
-        for run in runs(scenes=(scene,), gains={(SFM, 1): 0.0, ("mls", 8): gain}, noise=0.0)
+        for run in runs(
+            scenes=(scene,), gains={(SFM, 1): 0.0, ("mls", 8): gain}, noise=0.0, repeats=4
+        )
     ]
     assert (
         "; on fern, its worst scene, 0.25 dB less. A run takes 20 s" in conclude(one(finished))[0]

@@ -159,9 +159,18 @@ def test_a_method_may_report_findings_and_know_the_budget(wavy):
     ("change", "says"),
     [
         (lambda new: new.replace(xyz=np.full((4, 3), np.nan)), "at new point 0"),
-        (lambda new: new.select(slice(3)), "expected 4 new points; found 3"),
+        (lambda new: new.select(slice(3)), r"4 new points.*'Changing'; found a PointCloud of 3\."),
+        (lambda new: new.with_added(np.zeros((160, 3)), np.zeros((160, 3), np.uint8)),
+         r"found a PointCloud of 164\. Return the new points only"),
+        (lambda _: None, r"'Changing'; found None\."),
+        (lambda new: new.xyz, r"found float32 \[4, 3\]\."),
+        (lambda new: (new.xyz, new.rgb / 255), r"float32 \[4, 3\], float64 \[4, 3\]\. Correct"),
+        (lambda new: (new.xyz[:3], new.rgb), r"tuple of float32 \[3, 3\], uint8 \[4, 3\]\."),
+        (lambda new: new.replace(xyz=new.xyz[:3], rgb=new.rgb[:3]),
+         r"of shape \[3\], in method 'Changing', line \d+ of .*test_parameters\.py; found \[4\]"),
+        (lambda new: new.missing, r"'Changing', line \d+ of .*_parameters\.py; found Attribute"),
     ],
-)
+)  # fmt: skip
 def test_a_third_partys_bad_points_are_refused(change, says, wavy):
     with pytest.raises(PointCloudError, match=says):
         ss.upsample(wavy, Changing(change), num_points=len(wavy) + 4)

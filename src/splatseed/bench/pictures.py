@@ -25,6 +25,7 @@ from splatseed.bench.figures import shown_seeds
 from splatseed.bench.job import make_seeds, open_unchanged
 from splatseed.bench.plan import RunSpec
 from splatseed.bench.runs import run_folder
+from splatseed.bench.statistics import Difference
 from splatseed.bench.study import Study
 from splatseed.errors import SplatseedError
 from splatseed.findings import Finding
@@ -101,7 +102,7 @@ class ComparedView(NamedTuple):
 
     scene: str
     name: str
-    gain: float
+    gain: Difference
     pictures: Mapping[str, bytes]
     errors: Mapping[str, bytes]
     shape: float
