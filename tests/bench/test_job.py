@@ -17,6 +17,7 @@ from splatseed.bench.job import (
     Machine,
     RunOptions,
     execute_runs,
+    local_machine,
     make_seeds,
     open_unchanged,
     run_job,
@@ -168,6 +169,25 @@ def test_a_scene_that_has_changed_fails_its_run_alone_and_is_recorded(
     assert "open_unchanged" in error["traceback"]
     (done,) = execute_runs(tmp_path, [specs["sfm"]], here(in_process), RunOptions())
     assert read_run(tmp_path, broken).result == done.result  # which takes the error's place
+
+
+def test_processes_get_the_threads_that_the_user_allows(monkeypatch):
+    monkeypatch.setattr("splatseed.progress.available_cpus", lambda: 8)
+    monkeypatch.setenv("OMP_NUM_THREADS", "")
+    monkeypatch.setenv("NUMBA_NUM_THREADS", "3")
+    for jobs, threads in ((1, 3), (4, 2)):
+        machine = local_machine(jobs, "cpu")
+        assert machine.threads == threads
+        environment = machine.workers._free.get()
+        assert environment["OMP_NUM_THREADS"] == environment["NUMBA_NUM_THREADS"] == f"{threads}"
+
+
+def test_code_that_changed_since_the_plan_makes_no_run(specs, tmp_path):
+    for changed in ({"version": "0.0.1"}, {"method_version": "1.0+0123456789ab"}):
+        spec = dataclasses.replace(specs["linear"], **changed)
+        with pytest.raises(ParameterError, match="as it was when the benchmark was planned"):
+            run_job(spec, RunOptions(), tmp_path)
+    assert not (tmp_path / "runs").exists()
 
 
 def test_files_of_the_users_are_left_alone(specs, tmp_path, in_process):

@@ -18,7 +18,7 @@ import pandas as pd
 
 from splatseed.bench.plan import SFM, SHARED, Arm, RunResult, RunSpec, describe_budget
 from splatseed.bench.runs import BenchRun
-from splatseed.methods import METHODS, method_label
+from splatseed.methods import METHODS
 from splatseed.training.settings import StrategyName, TrainSettings
 
 _COLUMNS = ("strategy", "scene", "seeds", "repeat", "spec", "result")
@@ -130,7 +130,7 @@ class Study:
             f"splatseed {settings['version']}" if settings["version"] else "",
             *sorted(
                 {
-                    f"{method_label(spec.arm.method)} {spec.method_version}"
+                    f"{spec.arm.method} {spec.method_version}"
                     for spec in self.runs["spec"]
                     if spec.method_version
                 }
