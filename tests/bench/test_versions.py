@@ -130,13 +130,11 @@ def test_the_version_of_splatseed_covers_its_files(tmp_path, monkeypatch):
 
 
 def _of_code(planted, version, **changes):
-    specs = [
-        dataclasses.replace(
-            r.spec, method_version=version * (r.spec.arm.method != "sfm"), **changes
-        )
-        for r in planted
+    own = [code * (run.spec.arm.method != "sfm") for run in planned]
+    return [
+        dataclasses.replace(r, spec=dataclasses.replace(r.spec, method_version=v, **changes))
+        for r, v in zip(planned, own, strict=True)
     ]
-    return [dataclasses.replace(r, spec=s) for r, s in zip(planted, specs, strict=True)]
 
 
 def test_results_of_changed_code_are_kept_apart_and_named(tmp_path):

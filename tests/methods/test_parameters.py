@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from importlib.metadata import EntryPoint
 
 import numpy as np
@@ -118,6 +119,47 @@ def test_a_method_that_is_not_installed_or_broken_is_explained(monkeypatch):
     expected = r"'copies', no_such_module:Copies .*ModuleNotFoundError.*pip uninstall"
     with pytest.raises(MissingDependencyError, match=expected):
         ss.upsample(ss.PointCloud(np.zeros((1, 3)), np.zeros((1, 3), np.uint8)), "copies")
+
+
+def test_a_method_is_known_by_its_place_in_a_file(wavy, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "helper.py").write_text("SHIFT = 1.0")
+    file = tmp_path / "mls.py"
+    code = """
+from __future__ import annotations
+from dataclasses import dataclass
+from helper import SHIFT
+
+@dataclass(frozen=True)
+class Shifted:
+    by: float = {by}
+
+    def __call__(self, scene, num_new, rng, progress):
+        return scene.points.xyz[:num_new] + self.by * SHIFT, scene.points.rgb[:num_new]
+
+mls = Shifted(2.0)
+
+def stereo(scene, num_new, rng, progress):
+    return Shifted(3.0)(scene, num_new, rng, progress)
+"""
+    file.write_text(code.format(by=1.0))
+    for name, parameters, by in (
+        ("Shifted", {}, 1), ("Shifted", {"by": 4.0}, 4), ("mls", {}, 2), ("stereo", {}, 3)
+    ):  # fmt: skip
+        seeds = ss.upsample(wavy, f"{file}:{name}", num_points=170, **parameters)
+        np.testing.assert_allclose(seeds.xyz[160:], wavy.xyz[:10] + by, rtol=1e-6)
+        assert set(seeds.source[160:]) == {255}
+    given = ss.upsample(wavy, METHODS[f"{file}:stereo"](), num_points=170)
+    assert set(given.source[160:]) == {255}
+    file.write_text(code.format(by=5.0))  # as in a notebook, between two calls
+    seeds = ss.upsample(wavy, f"{file}:Shifted", num_points=170)
+    np.testing.assert_allclose(seeds.xyz[160:], wavy.xyz[:10] + 5, rtol=1e-6)
+    with pytest.raises(ParameterError, match=r"a parameter of .*it has none"):
+        ss.upsample(wavy, f"{file}:stereo", k=3)
+    for name, found in (("mls.py:none", "no attribute"), ("none.py:mls", "FileNotFound"),
+                        ("mls.py:SHIFT", "cannot be called")):  # fmt: skip
+        with pytest.raises(MissingDependencyError, match=found):
+            METHODS[f"{tmp_path / name}"]
 
 
 class Changing(Copies):

@@ -81,7 +81,7 @@ class Options:
     scenes: tuple[str, ...] = ()
     """Scene folders with photographs; demo: is a synthetic room. With --data: names of scenes."""
     methods: Annotated[tuple[str, ...], _list("--method", _DEFAULT.methods)] = ()
-    """Seeding methods; sfm, the original points, is the baseline."""
+    """Seeding methods; sfm, the original points, is the baseline; FILE.py:NAME is your own."""
     ratios: Annotated[tuple[float, ...], _list("--ratio", [f"{r:g}" for r in _DEFAULT.ratios])] = ()
     """Total points per original point."""
     budgets: Annotated[tuple[str, ...], _list("--budget", [fair_budget(_DEFAULT.ratios)])] = ()

@@ -18,7 +18,7 @@ import numpy as np
 from splatseed.errors import ParameterError, PointCloudError, SplatseedError
 from splatseed.methods.contract import Made, Upsampler, nothing_finite, traits_of
 from splatseed.methods.registry import chooses_number, source_code
-from splatseed.pointcloud import ORIGINAL, PointCloud
+from splatseed.pointcloud import GENERATED, ORIGINAL, PointCloud
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.runtime.memory import check_memory
 from splatseed.scene import Scene
@@ -59,7 +59,8 @@ def add_points(
     made = _call(
         name, method, (scene, num_new or 0, np.random.default_rng(seed), progress), offered
     )
-    new = _as_cloud(name, made, num_new, len(originals))
+    code = source_code(name) if _is_built_in(method) else GENERATED
+    new = _as_cloud(name, made, num_new, len(originals), code)
     return PointCloud.concatenate(originals, new)
 
 
@@ -72,10 +73,9 @@ def _call(name: str, method: Any, arguments: tuple[Any, ...], offered: Mapping[s
         parameters = signature(method).parameters
         made: Made = method(*arguments, **{k: v for k, v in offered.items() if k in parameters})
     except Exception as error:
-        module = getattr(method, "__module__", "")
-        if module.partition(".")[0] == "splatseed" or isinstance(error, MemoryError):
+        if _is_built_in(method) or isinstance(error, MemoryError):
             raise
-        file = getattr(sys.modules.get(module), "__file__", None)
+        file = getattr(sys.modules.get(getattr(method, "__module__", "")), "__file__", None)
         lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == file]
         where = f"method {name!r}" + (f", line {lines[-1]} of {file}" if lines else "")
         if isinstance(error, SplatseedError):
@@ -160,7 +160,13 @@ def planned_size(num_original: int, ratio: float | None, num_points: int | None)
     return num_points
 
 
-def _as_cloud(name: str, made: Made, num_new: int | None, num_original: int) -> PointCloud:
+def _is_built_in(method: Upsampler) -> bool:
+    return getattr(method, "__module__", "").partition(".")[0] == "splatseed"
+
+
+def _as_cloud(
+    name: str, made: Made, num_new: int | None, num_original: int, code: int
+) -> PointCloud:
     """Check the points that a method returned; ``num_new`` is None if it chose their number."""
     number, by = "M" if num_new is None else f"{num_new}", f"from method {name!r}"
     expected = (
@@ -186,7 +192,7 @@ def _as_cloud(name: str, made: Made, num_new: int | None, num_original: int) -> 
             found=f"{points.xyz[bad].tolist()} at new point {bad}",
             fix=f"{_FIX} Or float32 is too small for the coordinates of the scene.",
         )
-    source = np.where(points.source == ORIGINAL, np.uint8(source_code(name)), points.source)
+    source = np.where(points.source == ORIGINAL, np.uint8(code), points.source)
     return points.replace(source=source, original_idx=None)
 
 

@@ -101,7 +101,11 @@ def _load(entry: EntryPoint) -> type[Upsampler]:
     """Import a method; one that needs no call to be configured is wrapped as if it were a class."""
     file, _, name = entry.value.rpartition(":")
     try:
-        found = getattr(_import_file(file), name) if file.endswith(".py") else entry.load()
+        if file.endswith(".py"):
+            path = Path(file).resolve()
+            found = getattr(_import_file(path, path.read_bytes()), name)
+        else:
+            found = entry.load()
         if not callable(found):
             raise TypeError(f"{name} is {found!r}, which cannot be called")  # noqa: TRY301
     except Exception as error:  # another's code may raise anything
@@ -118,11 +122,10 @@ def _load(entry: EntryPoint) -> type[Upsampler]:
 
 
 @cache
-def _import_file(file: str) -> ModuleType:
-    """Import a file that is in no package, once; it may import what lies beside it, as a script."""
-    path = Path(file).resolve()
+def _import_file(path: Path, content: bytes) -> ModuleType:
+    """Import a file once per content; it may import what lies beside it, as a script may."""
     # Two files of one name are two modules, and none replaces an installed one.
-    name = f"{path.stem}_{fingerprint(str(path))[:8]}"
+    name = f"{path.stem}_{fingerprint(str(path), content)[:8]}"
     spec = spec_from_file_location(name, path)
     assert spec is not None and spec.loader is not None  # noqa: S101, PT018  (it ends with .py)
     sys.path.insert(0, str(path.parent))

@@ -39,7 +39,8 @@ class Options:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The scene folder to write."""
     method: str = DEFAULT_METHOD
-    """The method that makes new points; --method NAME --help shows its own options."""
+    """The method that makes new points; --method NAME --help shows its own options. FILE.py:NAME
+    is a method of your own."""
     ratio: float | None = None
     """Total points per original point, for methods that interpolate; 4 unless --num-points is
     given."""
