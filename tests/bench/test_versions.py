@@ -129,7 +129,7 @@ def test_the_version_of_splatseed_covers_its_files(tmp_path, monkeypatch):
     assert len(seen) == 2
 
 
-def _of_code(planted, version, **changes):
+def _of_code(planned, code, **changes):
     own = [code * (run.spec.arm.method != "sfm") for run in planned]
     return [
         dataclasses.replace(r, spec=dataclasses.replace(r.spec, method_version=v, **changes))
