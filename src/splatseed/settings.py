@@ -96,7 +96,8 @@ def change_settings(settings: Settings, name: str, values: Mapping[str, Any]) ->
     Raises:
         ParameterError: There is no such field; the message calls fields "parameters of ``name``".
     """
-    known = [field.name for field in getattr(settings, "__dataclass_fields__", {}).values()]
+    has_fields = dataclasses.is_dataclass(settings)
+    known = [field.name for field in dataclasses.fields(settings)] if has_fields else []
     for given in values:
         if given not in known:
             raise ParameterError(

@@ -179,7 +179,7 @@ def run_job(
     from splatseed.training.prepare import prepare_run  # noqa: PLC0415  (PyTorch)
 
     start = time.perf_counter()
-    _check_versions(spec)
+    check_versions(spec)
     with output_folder(run_folder(bench, spec), kind="bench", overwrite=True) as folder:
         progress("read", 0.0)
         scene = open_unchanged(spec.scene)
@@ -228,8 +228,12 @@ def run_remotely(spec: RunSpec, options: RunOptions) -> tuple[RunResult, dict[st
         return result, {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
 
 
-def _check_versions(spec: RunSpec) -> None:
-    """Check that the code of this process is that of the plan."""
+def check_versions(spec: RunSpec) -> None:
+    """Check that the code of this process is that of the plan.
+
+    Raises:
+        ParameterError: It is not.
+    """
     method = spec.arm.method
     own = "" if method == SFM else method_version(seeding_method(method))
     for what, planned, here in (

@@ -188,7 +188,15 @@ def configure(method: str, profile: Profile = "default", **parameters: Any) -> U
         raise ParameterError(
             "the profile 'default' or 'paper'", found=repr(profile), fix="Choose one of these."
         )
-    chosen: Any = getattr(kind, "paper", kind)() if profile == "paper" else kind()
+    make = getattr(kind, "paper", kind) if profile == "paper" else kind
+    try:
+        chosen: Any = make()
+    except TypeError as error:  # of another package's class
+        raise ParameterError(
+            f"a default for every parameter of method {method!r}",
+            found=f"{error}",
+            fix='Give its fields defaults (docs/methods.md, "Your own method").',
+        ) from error
     configured: Upsampler = change_settings(chosen, method, parameters)
     return configured
 
