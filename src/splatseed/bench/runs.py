@@ -116,15 +116,15 @@ def read_runs(bench: StrPath) -> list[BenchRun]:
 
 def changed_code(bench: Path, planned: Sequence[RunSpec]) -> Iterator[Finding]:
     """Find whether ``planned`` runs repeat finished ones of a benchmark with other code."""
-    repeated = dict[str, RunSpec]()
+    repeated = dict[tuple[str, str], RunSpec]()
     for spec in planned:
         if not (run_folder(bench, spec) / RESULT).is_file():
-            repeated[replace(spec, version="", method_version="").key] = spec
-    changes, count = defaultdict[str, set[str]](set), set[str]()
+            repeated[_without_code(spec)] = spec
+    changes, count = defaultdict[str, set[str]](set), set[tuple[str, str]]()
     for path in bench.glob(f"runs/*/{RESULT}"):
         with suppress(SceneFormatError):  # of another version's layout
             old = _read(path.parent).spec
-            key = replace(old, version="", method_version="").key
+            key = _without_code(old)
             if (new := repeated.get(key)) is not None:
                 count.add(key)
                 for what, before, now in (
@@ -140,6 +140,11 @@ def changed_code(bench: Path, planned: Sequence[RunSpec]) -> Iterator[Finding]:
             "The earlier results are kept apart."
         )
         yield Finding("changed-code", text, "info", subjects=tuple(changes))
+
+
+def _without_code(spec: RunSpec) -> tuple[str, str]:
+    """What is the same of a run by other code; files of one name are different methods."""
+    return replace(spec, version="", method_version="").key, spec.arm.method
 
 
 def count_runs(runs: Sequence[BenchRun]) -> str:
