@@ -42,9 +42,9 @@ class SplatseedError(Exception):
         """Return the message; ``KeyError`` would quote it."""
         return str(self.args[0])
 
-    def __reduce__(self) -> tuple[partial[SplatseedError], tuple[str]]:
-        """Make errors with keyword-only arguments picklable."""
-        return partial(type(self), found=self.found, fix=self.fix), (self.expected,)
+    def __reduce__(self) -> tuple[partial[SplatseedError], tuple[str], dict[str, object]]:
+        """Make errors with keyword-only arguments picklable; keeps their notes."""
+        return partial(type(self), found=self.found, fix=self.fix), (self.expected,), vars(self)
 
 
 class InputError(SplatseedError):

@@ -82,6 +82,36 @@ def test_runs_everything_once_and_a_failed_run_ends_nothing_else(here, bench, pl
     assert {"cpu", "cores", "python", "versions"} <= calls[0].keys()
 
 
+def test_a_changed_method_in_a_file_is_run_again_and_the_change_is_named(
+    here, bench, plan_path, tmp_path
+):
+    file, folder = tmp_path / "mine.py", tmp_path / "B"
+    code = (
+        "def shifted(scene, num_new, rng, progress):\n"
+        "    rows = rng.integers(0, len(scene.points), num_new)\n"
+        "    return scene.points.xyz[rows] + {shift}, scene.points.rgb[rows]\n"
+    )
+    file.write_text(code.format(shift=0.01))
+    words = ("--plan", plan_path(repeats=1), "--methods", "sfm", f"{file}:shifted", "-o", folder)
+    code_, out, err = bench(*words)
+    assert (code_, err) == (0, "")
+    first = {path.parent.name for path in folder.glob("runs/*/result.json")}
+    file.write_text(code.format(shift=0.02))
+    code_, out, err = bench("-o", folder)  # by the absolute path in plan.toml
+    assert code_ == 0
+    assert "2 runs, 1 done, 1 pending" in out
+    assert re.search(r"The code has changed \(1 run to repeat\): method .*mine.py:shifted is", err)
+    second = {path.parent.name for path in folder.glob("runs/*/result.json")}
+    assert len(second - first) == 1
+    code_, out, err = bench("-o", folder)
+    assert "2 runs, 2 done" in out
+    assert "changed" not in err
+    _, out, _ = bench("report", folder)
+    assert "code=" in out
+    file.write_text("def other(): ...\n")
+    assert "no attribute 'shifted'" in bench("-o", folder).err
+
+
 @pytest.mark.slow
 def test_killed_in_training_it_goes_on(here, bench, plan_path, tmp_path):
     folder = tmp_path / "B"

@@ -26,7 +26,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 MEASURED = sorted((ROOT / "benchmarks").rglob("*.md"))
 LINKED = dict.fromkeys([*PAGES, *ROOT.glob("*.md"), *MEASURED])
 OWN_METHOD = "jitter"
-"""Of an example, which has to be installed first."""
+"""Of an example, which has to be installed or written first."""
 OTHERS = {"--max-2D-matches-per-3D-point"}
 """Options of other programs that our pages name."""
 
@@ -49,7 +49,8 @@ def _commands():
     for page in (*PAGES, *MEASURED):
         for line in "".join(_blocks(page)).replace("\\\n", " ").splitlines():
             words = shlex.split(line.partition(">")[0], comments=True)
-            if words and Path(words[0]).name == "splatseed" and OWN_METHOD not in words:
+            own = any(OWN_METHOD in word for word in words)
+            if words and Path(words[0]).name == "splatseed" and not own:
                 found.setdefault(tuple(words[1:]), page.name)
     for words, name in found.items():
         yield pytest.param(list(words), id=f"{name}: {' '.join(words)}")

@@ -28,6 +28,7 @@ from splatseed.bench.plan_file import PLAN, plan_text, read_plan
 from splatseed.bench.runs import (
     ERROR,
     BenchRun,
+    changed_code,
     check_bench_folder,
     count_runs,
     estimate_seconds,
@@ -43,7 +44,7 @@ from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.findings import Finding
 from splatseed.io.staging import atomic_file
 from splatseed.methods import Profile
-from splatseed.requirements import require, version_of
+from splatseed.requirements import require
 from splatseed.runtime.interruption import exit_code
 from splatseed.runtime.memory import check_memory
 from splatseed.text import counted, did_you_mean, format_duration, name_some, quoted, visible
@@ -80,7 +81,7 @@ class Options:
     scenes: tuple[str, ...] = ()
     """Scene folders with photographs; demo: is a synthetic room. With --data: names of scenes."""
     methods: Annotated[tuple[str, ...], _list("--method", _DEFAULT.methods)] = ()
-    """Seeding methods; sfm, the original points, is the baseline."""
+    """Seeding methods; sfm, the original points, is the baseline; FILE.py:NAME is your own."""
     ratios: Annotated[tuple[float, ...], _list("--ratio", [f"{r:g}" for r in _DEFAULT.ratios])] = ()
     """Total points per original point."""
     budgets: Annotated[tuple[str, ...], _list("--budget", [fair_budget(_DEFAULT.ratios)])] = ()
@@ -255,9 +256,10 @@ def _prepare(
         raise SceneNotFoundError(expected, found=found, fix="Name the folder that holds them.")
     plan = replace(plan, scenes=tuple(scene for scene, _ in present))
     scenes = [facts for _, facts in present]
-    specs = plan_runs(plan, scenes, machine.backend, version_of("splatseed") or "")
+    specs = plan_runs(plan, scenes, machine.backend)
     findings = [*missing, *_budget_findings(options, plan), *of_scenes]
     findings += [*_data_findings(plan, scenes), *_full_budgets(plan, specs)]
+    findings += changed_code(options.output, specs) if options.output else ()
     fix = "Name other methods, or what these need."
     refuse((not specs, "a plan with runs", "; ".join(map(str, findings)) or "none", fix))
     # The memory of a cluster's nodes is unknown.

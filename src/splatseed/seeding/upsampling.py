@@ -66,8 +66,9 @@ def upsample(
         scene: A scene or a cloud. New points start from originals (``source`` 0) and replace all
             points that were added before, which a note counts: add points of your own to the
             result.
-        method: A key of ``METHODS``, or a configured method. "auto" compares the photographs;
-            without photographs "mls" replaces it, with a note.
+        method: A key of ``METHODS``, a place such as "my_method.py:Jitter", or a configured method
+            or function. "auto" compares the photographs; without photographs "mls" replaces it,
+            with a note.
         ratio: Points in all, as a multiple of the originals, for methods that interpolate; 4 if
             neither it nor ``num_points`` is given. "auto", "stereo" and "cover" choose the number
             themselves and accept neither.

@@ -436,8 +436,8 @@ def _call(
     """Run a job in a child process; return its result."""
     log = staging / _WORK / "log.txt"
     call = (_work, images, staging, settings, kept, job, arguments)
-    limit = {"NUMBA_NUM_THREADS": str(settings.threads)} if settings.threads > 0 else {}
-    environment = {**_CHILD, **limit}
+    limited = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS") if settings.threads > 0 else ()
+    environment = {**_CHILD, **dict.fromkeys(limited, str(settings.threads))}
     with closing(Child(*call, reports=True, environment=environment, log=log.open("w+b"))) as child:
         try:
             return child.result(progress)

@@ -56,7 +56,7 @@ INTERPOLATING = ("linear", "triangle", "spline", "mls", "voronoi", "random")
 
 def parameters_of(method: Upsampler) -> dict[str, object]:
     """Return a method's parameters by name, without those of a cloud that other lines show."""
-    given = dataclasses.asdict(method)  # type: ignore[call-overload]  # a method is a dataclass
+    given = dataclasses.asdict(method) if dataclasses.is_dataclass(method) else {}  # type: ignore[arg-type]  # an instance
     return {name: value for name, value in given.items() if name not in CLOUD_PARAMETERS}
 
 
