@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import TypeAlias
 
-from splatseed.findings import Finding
+from splatseed.findings import LEVELS, LOGGER, Finding
 
 Progress: TypeAlias = Callable[[str, float], None]
 Note: TypeAlias = Callable[[Finding], None]
@@ -36,6 +36,11 @@ def silent(stage: str, fraction: float) -> None:
 
 def silent_note(finding: Finding) -> None:
     """Ignore the finding."""
+
+
+def log_note(finding: Finding) -> None:
+    """Log the finding, by default of the public functions; the record has it as ``finding``."""
+    LOGGER.log(LEVELS[finding.severity], "%s", finding, extra={"finding": finding})
 
 
 class StageTimes:

@@ -15,7 +15,7 @@ import numpy as np
 
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.methods.contract import Made, Upsampler, nothing_finite, traits_of
-from splatseed.methods.registry import chooses_number, source_code
+from splatseed.methods.registry import METHODS, chooses_number, source_code
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.runtime.memory import check_memory
@@ -47,7 +47,8 @@ def add_points(
     Other arguments and errors are those of ``splatseed.upsample``.
     """
     originals = scene.points.originals
-    num_new = number_of_new(method, name, scene, ratio, num_points)
+    with METHODS.named(name):
+        num_new = number_of_new(method, name, scene, ratio, num_points)
     if num_new == 0 and len(originals) > 0:
         return originals
     if "points" in traits_of(method).needs and not originals.finite.any():
@@ -55,8 +56,10 @@ def add_points(
     call: Any = method  # with parameters beyond the contract's
     offered = {"note": note, "budget": budget, "on_stereo": on_stereo}
     taken = {key: offered[key] for key in offered if key in signature(call).parameters}
-    made = call(scene, num_new or 0, np.random.default_rng(seed), progress, **taken)
-    return PointCloud.concatenate(originals, _as_cloud(made, num_new, source_code(name)))
+    with METHODS.named(name):
+        made = call(scene, num_new or 0, np.random.default_rng(seed), progress, **taken)
+        cloud = _as_cloud(made, num_new, source_code(name))
+    return PointCloud.concatenate(originals, cloud)
 
 
 def number_of_new(

@@ -8,19 +8,26 @@ looked up. No package can replace a built-in method.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import cached_property
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from types import MappingProxyType
 from typing import Any, Literal, cast
 
-from splatseed.errors import MissingDependencyError, ParameterError, UnknownNameError
+from splatseed.errors import (
+    MissingDependencyError,
+    ParameterError,
+    PluginError,
+    SplatseedError,
+    UnknownNameError,
+)
 from splatseed.methods.contract import Need, Upsampler, traits_of
 from splatseed.pointcloud import GENERATED, ORIGINAL, PointCloud
 from splatseed.requirements import pip_command
 from splatseed.scene import Scene
 from splatseed.settings import change_settings
-from splatseed.text import did_you_mean
+from splatseed.text import describe_exception, did_you_mean
 
 GROUP = "splatseed.methods"
 
@@ -66,13 +73,35 @@ class MethodRegistry(Mapping[str, type[Upsampler]]):
         try:
             return cast("type[Upsampler]", entry.load())
         except Exception as error:  # another's code may raise anything
-            package = entry.dist.name if entry.dist else entry.value
-            raise MissingDependencyError(
-                f"method {name!r}, {entry.value} of the package {package}, to be imported",
-                found=f"{type(error).__name__}: {error}",
-                fix="Correct the package and install it again, or do without: "
-                f"{pip_command('uninstall', package)}.",
-            ) from error
+            raise self._fault(MissingDependencyError, name, "to be imported", error) from error
+
+    @contextmanager
+    def named(self, name: str) -> Iterator[None]:
+        """Name the package of the method whose code runs in the block if that raises an exception.
+
+        Raises:
+            PluginError: An exception that is no error of splatseed, in a method of another package.
+        """
+        try:
+            yield
+        except (SplatseedError, MemoryError):
+            raise
+        except Exception as error:
+            if name not in self._plugins:
+                raise
+            raise self._fault(PluginError, name, "without an exception", error) from error
+
+    def _fault(
+        self, kind: type[SplatseedError], name: str, expected: str, error: Exception
+    ) -> SplatseedError:
+        entry = self._plugins[name]
+        package = entry.dist.name if entry.dist else entry.value
+        return kind(
+            f"method {name!r}, {entry.value} of the package {package}, {expected}",
+            found=describe_exception(error),
+            fix="Correct the package and install it again, or do without: "
+            f"{pip_command('uninstall', package)}.",
+        )
 
     def __contains__(self, name: object) -> bool:
         return name in BUILT_IN or name in self._plugins
@@ -134,8 +163,9 @@ def configure(method: str, profile: Profile = "default", **parameters: Any) -> U
         raise ParameterError(
             "the profile 'default' or 'paper'", found=repr(profile), fix="Choose one of these."
         )
-    chosen: Any = getattr(kind, "paper", kind)() if profile == "paper" else kind()
-    configured: Upsampler = change_settings(chosen, method, parameters)
+    with METHODS.named(method):
+        chosen: Any = getattr(kind, "paper", kind)() if profile == "paper" else kind()
+        configured: Upsampler = change_settings(chosen, method, parameters)
     return configured
 
 
