@@ -135,11 +135,13 @@ def hold(context: AbstractContextManager[Any]) -> Any:
 
 
 def configure(reporting: Reporting) -> None:
-    """Print what the options ask for from now on.
+    """Print what the options ask for until the call of the command line ends.
 
     Raises:
         OSError: The log file cannot be written.
     """
+    if _SESSION.stack is None:
+        return
     _SESSION.json = OUT.quiet = reporting.json
     levels = {reporting.verbose: logging.DEBUG, reporting.quiet: logging.WARNING}
     _SESSION.shown = levels.get(True, logging.INFO)

@@ -51,9 +51,8 @@ def require(*packages: str) -> None:
         what = "it" if len(missing) == 1 else "them"
         advice = f"Install {what} (extra {extras}): {install_command(*missing)}."
         if "torch" in missing:
-            cpu = pip_command("install", "torch", "--index-url", _CPU_BUILDS)
-            advice += " On a machine without a GPU, PyTorch's CPU build suffices; to have it, first"
-            advice += f" run: {cpu}."
+            advice += " On a machine without a GPU, PyTorch's CPU build suffices: "
+            advice += f"{install_command(*missing)} --extra-index-url {_CPU_BUILDS}."
         raise MissingDependencyError(
             f"the package{'s' * (len(packages) > 1)} {', '.join(packages)}",
             found=f"no {', no '.join(missing)}",
