@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import shlex
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -19,7 +20,6 @@ from splatseed.console import Reporting, configure, hold, print_message
 from splatseed.errors import OutputError, ParameterError
 from splatseed.io.staging import check_parents, check_separate, reserved, translate_write_errors
 from splatseed.requirements import version_of
-from splatseed.text import quoted
 
 Options = TypeVar("Options")
 
@@ -60,7 +60,7 @@ def parse_options(
     refuse((both, "--quiet or --verbose", "both", "Leave one of them out."))
     with translate_write_errors(reporting.log or Path()):
         configure(reporting)
-    command = " ".join(map(quoted, ["splatseed", verb, *arguments]))
+    command = shlex.join(["splatseed", *verb.split(), *arguments])
     print_message(f"splatseed {version_of('splatseed')}: {command}", logging.DEBUG)
     for path in {values.get(name) for name in _WRITTEN} - {None}:
         if str(path) == "-":
