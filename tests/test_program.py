@@ -100,7 +100,6 @@ def test_one_object_holds_what_is_printed(cloud, tmp_path, splatseed):
     facts = json.loads(splatseed("info", cloud, "--json").out)
     assert facts["points"]["num_points"] == 40
     assert facts["points"]["duplicates"] == 1
-    assert "It has 39 distinct points" in facts["reasons"][0] or facts["advice"] == "mls"
     for text in (facts["verdict"], facts["advice"], *facts["reasons"], "40"):
         assert text in info.out
     for each in facts["next"]:

@@ -47,7 +47,7 @@ def add_points(
     Other arguments and errors are those of ``splatseed.upsample``.
     """
     originals = scene.points.originals
-    with METHODS.named(name):
+    with METHODS.named(method):
         num_new = number_of_new(method, name, scene, ratio, num_points)
     if num_new == 0 and len(originals) > 0:
         return originals
@@ -56,7 +56,7 @@ def add_points(
     call: Any = method  # with parameters beyond the contract's
     offered = {"note": note, "budget": budget, "on_stereo": on_stereo}
     taken = {key: offered[key] for key in offered if key in signature(call).parameters}
-    with METHODS.named(name):
+    with METHODS.named(method):
         made = call(scene, num_new or 0, np.random.default_rng(seed), progress, **taken)
         cloud = _as_cloud(made, num_new, source_code(name))
     return PointCloud.concatenate(originals, cloud)

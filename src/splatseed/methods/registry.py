@@ -8,7 +8,7 @@ looked up. No package can replace a built-in method.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cached_property
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
@@ -76,7 +76,7 @@ class MethodRegistry(Mapping[str, type[Upsampler]]):
             raise self._fault(MissingDependencyError, name, "to be imported", error) from error
 
     @contextmanager
-    def named(self, name: str) -> Iterator[None]:
+    def named(self, method: str | Upsampler) -> Iterator[None]:
         """Name the package of the method whose code runs in the block if that raises an exception.
 
         Raises:
@@ -87,9 +87,19 @@ class MethodRegistry(Mapping[str, type[Upsampler]]):
         except (SplatseedError, MemoryError):
             raise
         except Exception as error:
-            if name not in self._plugins:
+            name = self._plugin_of(method)
+            if name is None:
                 raise
             raise self._fault(PluginError, name, "without an exception", error) from error
+
+    def _plugin_of(self, method: str | Upsampler) -> str | None:
+        if isinstance(method, str):
+            return method if method in self._plugins else None
+        for name, entry in self._plugins.items():
+            with suppress(Exception):  # one that cannot be imported is not this one
+                if isinstance(method, entry.load()):
+                    return name
+        return None
 
     def _fault(
         self, kind: type[SplatseedError], name: str, expected: str, error: Exception
