@@ -95,8 +95,10 @@ def _run_verb(words: list[str]) -> None:
         # Only this verb is imported, so that --help does not wait for Numba.
         try:
             import_module(f"splatseed.commands.{verb}").run(words[1:])
-        finally:
+        except SystemExit:  # with another exit code than 0, perhaps with results
             print_report()
+            raise
+        print_report()
     elif verb in {"-h", "--help"}:
         _print_help()
     elif verb in {"-V", "--version"}:

@@ -347,7 +347,7 @@ def _bench(options: Options, plan: Plan, machine: Machine, arguments: Sequence[s
         plan, _, specs, findings = _prepare(options, plan, machine, demo)
         runs = [read_run(bench, spec) if bench else BenchRun(spec) for spec in specs]
         lines = [*map(str, findings), *_announcement(plan, runs, machine)]
-        add_results(plan=tomllib.loads(plan_text(plan)), runs=len(runs), notes=lines)
+        add_results(plan=tomllib.loads(plan_text(plan)), num_runs=len(runs), notes=lines)
         comments = "".join(f"# {' '.join(line.split())}\n" for line in lines)
         OUT.print(f"{plan_text(plan)}\n{comments}", end="", soft_wrap=True)
         return
