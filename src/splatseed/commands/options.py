@@ -62,7 +62,7 @@ def parse_options(
         configure(reporting)
     command = shlex.join(["splatseed", *verb.split(), *arguments])
     print_message(f"splatseed {version_of('splatseed')}: {command}", logging.DEBUG)
-    for path in {values.get(name) for name in _WRITTEN} - {None}:
+    for path in {values[name] for name in _WRITTEN if values.get(name) is not None}:
         if str(path) == "-":
             fix = "Name one; --json prints the results to stdout."
             raise OutputError("the name of a file or folder to write", found="-", fix=fix)
