@@ -423,7 +423,8 @@ def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]
         table.add_row(*map(visible, row))
     _print_title(title)
     # In a file, no name needs to be cut off at an edge.
-    (OUT if OUT.is_terminal else LiteralConsole(file=OUT.file, width=FILE_WIDTH)).print(table)
+    wide = LiteralConsole(file=OUT.file, width=FILE_WIDTH, quiet=OUT.quiet)
+    (OUT if OUT.is_terminal else wide).print(table)
 
 
 def _print_title(title: str) -> None:

@@ -323,8 +323,8 @@ def test_the_maps_are_named_and_noted_or_the_scenes_own(room, surfaces, tmp_path
     (bare / "depths").unlink()
     assert "depth maps" not in splatseed("upsample", bare, *words, tmp_path / "bare_lines").err
     run = splatseed("upsample", bare, "--method", "depth", "-o", tmp_path / "none")
-    assert (run.code, run.err.count("\n")) == (2, 1)
-    assert "--depth" in run.err
+    assert (run.code, run.unexpected.count("\n")) == (2, 1)
+    assert "--depth" in run.unexpected
 
 
 def test_a_capture_has_its_own_maps_and_needs_no_points(rgbd, surfaces, tmp_path, splatseed):
