@@ -42,11 +42,12 @@ def _refused(run, *named):
     """Check the rules that all errors obey, and what this one names; returns its text."""
     assert run.code == 2, run
     assert "Traceback" not in run.out + run.err
-    said = " ".join(re.sub("[│╭╮╰╯─]", " ", run.err).split())  # tyro's boxes
-    if run.err.startswith("error: "):
-        assert run.err.startswith("error: expected ")
-        assert run.err.count("\n") == 1
-        assert "; found " in run.err
+    err = run.unexpected
+    said = " ".join(re.sub("[│╭╮╰╯─]", " ", err).split())  # tyro's boxes
+    if err.startswith("error: "):
+        assert err.startswith("error: expected ")
+        assert err.count("\n") == 1
+        assert "; found " in err
     else:
         assert "--help" in said
     for text in named:

@@ -440,7 +440,7 @@ def _print_summary(bench: Path, runs: Sequence[BenchRun]) -> None:
     tables = [arm_table(study) for study in studies(runs)]
     for table in tables:
         _print_table(table)
-    shown = [{"title": t.title, "rows": t.shown().to_dict("records")} for t in tables]
+    shown = [{"title": t.title, "header": t.header, "rows": t.shown().to_numpy()} for t in tables]
     add_results(output=bench, runs=[_facts(bench, run) for run in runs], tables=shown)
     print_failures(bench, runs)
     pending = sum(run.result is None for run in runs)
