@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import splatseed as ss
+from splatseed.commands import info
 from splatseed.errors import OutputError, PluginError
 from splatseed.io.staging import reserved
 from splatseed.methods.registry import GROUP
@@ -96,15 +97,26 @@ def test_one_object_holds_what_is_printed(cloud, tmp_path, splatseed):
     notes = [line.removeprefix("note: ") for line in plain.err.splitlines() if "note: " in line]
     assert [f"{each['text']} {each['fix']}".strip() for each in made["findings"]] == notes
     assert notes
-    info = splatseed("info", cloud)
+    shown = splatseed("info", cloud)
     facts = json.loads(splatseed("info", cloud, "--json").out)
     assert facts["points"]["num_points"] == 40
     assert facts["points"]["duplicates"] == 1
     for text in (facts["verdict"], facts["advice"], *facts["reasons"], "40"):
-        assert text in info.out
+        assert text in shown.out
     for each in facts["next"]:
-        assert each["command"] in info.out
+        assert each["command"] in shown.out
     assert (facts["planned"]["max_steps"], facts["planned"]["trainer"]) == (30_000, "splatseed")
+
+
+def test_what_other_libraries_print_is_no_part_of_it(cloud, splatseed, monkeypatch):
+    read = info.load_scene
+    monkeypatch.setattr(
+        info, "load_scene", lambda *a, **k: (sys.stdout.write("loud"), read(*a, **k))[1]
+    )
+    run = splatseed("info", cloud, "--json")
+    assert json.loads(run.out)["points"]["num_points"] == 40
+    assert "loud" in run.err
+    assert splatseed("info", cloud).out.startswith("loud")  # and nothing lasts
 
 
 def test_results_are_apart_from_messages(cloud, tmp_path, splatseed):

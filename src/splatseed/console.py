@@ -12,10 +12,17 @@ import json
 import logging
 import math
 import re
+import sys
 import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import (
+    AbstractContextManager,
+    ExitStack,
+    contextmanager,
+    nullcontext,
+    redirect_stdout,
+)
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -59,11 +66,12 @@ class _Session(logging.Handler):
     def __init__(self) -> None:
         super().__init__()
         self.log: IO[str] | None = None
+        self.stdout: IO[str] | None = None  # for ``--json``, away from what other libraries print
         self.stack: ExitStack | None = None  # None outside of a call
         self.reset()
 
     def reset(self) -> None:
-        self.shown, self.json = logging.INFO, False
+        self.shown = logging.INFO
         self.results: dict[str, Any] = {}
         self.findings: dict[Finding, None] = {}
         self.next: list[dict[str, str]] = []
@@ -124,7 +132,7 @@ def session() -> Iterator[None]:
     finally:
         LOGGER.removeHandler(_SESSION)
         LOGGER.setLevel(level)
-        _SESSION.log = _SESSION.stack = None
+        _SESSION.log = _SESSION.stdout = _SESSION.stack = None
         _SESSION.reset()
         OUT.quiet = False
 
@@ -142,7 +150,9 @@ def configure(reporting: Reporting) -> None:
     """
     if _SESSION.stack is None:
         return
-    _SESSION.json = OUT.quiet = reporting.json
+    if reporting.json:
+        OUT.quiet, _SESSION.stdout = True, sys.stdout
+        hold(redirect_stdout(sys.stderr))
     levels = {reporting.verbose: logging.DEBUG, reporting.quiet: logging.WARNING}
     _SESSION.shown = levels.get(True, logging.INFO)
     if reporting.log is not None:
@@ -167,12 +177,12 @@ def add_results(**results: object) -> None:
 
 def print_report() -> None:
     """With ``--json``, print the results so far with findings and next commands, as one object."""
-    if _SESSION.json and _SESSION.results:
+    if _SESSION.stdout is not None and _SESSION.results:
         notes = {"findings": list(_SESSION.findings), "next": _SESSION.next}
         content = as_json({**_SESSION.results, **notes})
-        print(json.dumps(content, indent=2, allow_nan=False), file=OUT.file)
+        print(json.dumps(content, indent=2, allow_nan=False), file=_SESSION.stdout)
     _SESSION.results = {}
-    OUT.file.flush()  # a parent process may wait for it
+    (_SESSION.stdout or OUT.file).flush()  # a parent process may wait for it
 
 
 def as_json(value: Any) -> Any:
