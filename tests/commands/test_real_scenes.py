@@ -37,7 +37,7 @@ def test_colmap_scenes_are_described_and_upsampled(name, method, scenes, tmp_pat
     assert ("train it with" in run.out) == bool(before.images)
     # Duplicates of the input are left out, and told of.
     assert 1.9 * len(before.points) < len(after.points) <= 2 * len(before.points)
-    assert ("repeat the position" in run.out) == ("left out" in run.out)
+    assert ("repeat the position" in run.err) == ("left out" in run.err)
     assert re.search(rf"points in +{total:,}\n", run.out)
 
 
