@@ -16,7 +16,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import TypeAlias
 
-from splatseed.findings import Finding
+from splatseed.findings import LEVELS, LOGGER, Finding
 
 Progress: TypeAlias = Callable[[str, float], None]
 Note: TypeAlias = Callable[[Finding], None]
@@ -38,6 +38,11 @@ def silent(stage: str, fraction: float) -> None:
 
 def silent_note(finding: Finding) -> None:
     """Ignore the finding."""
+
+
+def log_note(finding: Finding) -> None:
+    """Log the finding, by default of the public functions; the record has it as ``finding``."""
+    LOGGER.log(LEVELS[finding.severity], "%s", finding, extra={"finding": finding})
 
 
 class StageTimes:

@@ -19,7 +19,7 @@ from splatseed.bench import pictures as pictures_module
 from splatseed.bench.figures import arm_figure, curve_figure, scene_figure, seconds_figure
 from splatseed.bench.plan import SFM
 from splatseed.bench.report import REPORT, write_report
-from splatseed.bench.runs import BenchRun, locked_bench, run_folder
+from splatseed.bench.runs import BenchRun, run_folder
 from splatseed.bench.scenes import scene_digest
 from splatseed.bench.study import studies
 from splatseed.bench.versions import splatseed_version
@@ -138,12 +138,6 @@ def test_others_files_are_not_replaced_and_bad_folders_are_one_error(tmp_path):
     (bench / "planned.json").write_text('{"calls": [], "runs": [{}]}')
     with pytest.raises(SceneFormatError, match=r"planned\.json"):
         write_report(bench)
-    with (
-        locked_bench(bench),
-        pytest.raises(OutputError, match="no other process"),
-        locked_bench(bench),
-    ):
-        pass
 
 
 def test_the_commands_say_what_they_found(tmp_path, capsys, blank_figures):

@@ -185,7 +185,7 @@ def test_export_writes_the_page_of_a_run_or_a_file(run_folder, tmp_path, splatse
     write_gaussians(alone, dataclasses.replace(read_gaussians(run_folder), antialiased=True))
     run = splatseed("export", alone, "-o", tmp_path / "alone.html")
     assert run.code == 0, run.err
-    assert "antialiased rendering, which a web page cannot record" in " ".join(run.out.split())
+    assert "antialiased rendering, which a web page cannot record" in " ".join(run.err.split())
     messages, _ = messages_of(tmp_path / "alone.html")
     assert "GaussianSplatsMessage" in messages
     assert export.PAGE in splatseed("export", alone, "-o", tmp_path / "a.htm").err

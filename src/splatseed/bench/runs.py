@@ -1,4 +1,4 @@
-"""Read and lock a benchmark's folder, and record what is planned.
+"""Read a benchmark's folder, and record what is planned.
 
 ``planned.json`` records the calls of the command and the runs of the last plan. A folder
 ``runs/KEY`` with a ``result.json`` is a finished run, which is not repeated; with an ``error.json``
@@ -14,7 +14,7 @@ import shlex
 import socket
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,14 +25,7 @@ from splatseed.bench.plan import RunResult, RunSpec
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
 from splatseed.findings import Finding
 from splatseed.io.files import StrPath, read_text
-from splatseed.io.staging import (
-    MANIFEST,
-    check_output,
-    check_separate,
-    locked,
-    read_manifest,
-    write_json,
-)
+from splatseed.io.staging import MANIFEST, check_output, check_separate, read_manifest, write_json
 from splatseed.requirements import version_of
 from splatseed.text import counted
 
@@ -172,23 +165,6 @@ def check_bench_folder(folder: Path, protect: Sequence[Path]) -> None:
         expected = f"the folder of splatseed bench, or a new one, at {folder}"
         found = f"what splatseed {kind} wrote"
         raise OutputError(expected, found=found, fix="Choose another folder.")
-
-
-@contextmanager
-def locked_bench(bench: Path) -> Iterator[None]:
-    """Lock a benchmark's folder against other processes.
-
-    Raises:
-        OutputError: Another process holds the lock.
-    """
-    with ExitStack() as stack:
-        try:
-            stack.enter_context(locked(bench))
-        except BlockingIOError:
-            fix = "Wait until it ends, stop it, or name another folder."
-            expected = f"no other process that runs {bench}"
-            raise OutputError(expected, found="one", fix=fix) from None
-        yield
 
 
 def record_plan(bench: Path, verb: str, specs: Iterable[RunSpec], arguments: Sequence[str]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 
 from splatseed.commands.options import check_free, parse_options, refuse
-from splatseed.console import print_note, print_pairs, stage_display
+from splatseed.console import add_results, print_next, print_note, print_pairs, stage_display
 from splatseed.errors import InputError, ParameterError
 from splatseed.findings import Finding
 from splatseed.io.origin import RECENTER, choose_origin, format_offset, offset_beside, write_offset
@@ -136,6 +136,13 @@ def run(arguments: list[str]) -> None:
         ("output", str(target)),
     ]
     print_pairs("splatseed export", rows)
+    add_results(
+        output=target, format=job.format, gaussians=len(kept), of=len(gaussians), bytes=after
+    )
+    if loss is not None:
+        alike = dict(zip(list(stages)[1:], loss.likeness, strict=True))
+        psnr = dict(zip(stages, loss.scores, strict=bool(loss.scores)))
+        add_results(views=loss.views, psnr=psnr, likeness=alike)
     print_note(*findings, *_format_findings(job), *_loss_findings(loss, stages, job))
     _print_next(job)
 
@@ -171,6 +178,8 @@ def _checked(options: Options) -> _Job:
     )  # fmt: skip
     if cleans or page:
         require("torch", *["viser"] * page)
+    if named and options.budget is not None:
+        require("torch", "gsplat")
     budget = None if options.budget is None else parse_budget(options.budget, 0)
     if not named and scene is not None and not scene.exists():
         scene = None  # the run was made elsewhere
@@ -357,14 +366,14 @@ def _print_next(job: _Job) -> None:
     options = job.options
     if job.is_page:
         link = visible(options.output.resolve().as_uri())
-        print_pairs("next", [("open it in a browser, here or wherever you send it", link)])
+        print_next([("open it in a browser, here or wherever you send it", link)])
         return
     rows = [("look at it", f"splatseed view {quoted(options.output)}")]
     split = job.config.get("split")
     unscored = isinstance(split, dict) and not split.get("test")  # nothing was held out
     if job.transform is None and not unscored:  # moved, its scene is elsewhere
         rows.append(("score it", _scoring_command(job)))
-    print_pairs("next", rows)
+    print_next(rows)
 
 
 def _scoring_command(job: _Job) -> str:

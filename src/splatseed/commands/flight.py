@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 
 from splatseed.commands.options import check_free, parse_options, refuse
-from splatseed.console import print_note, print_pairs, stage_display
+from splatseed.console import add_results, print_note, print_pairs, stage_display
 from splatseed.errors import ParameterError
 from splatseed.findings import Finding
 from splatseed.io.origin import find_shift
@@ -192,6 +192,7 @@ def _summarise(options: Options, flight: _Flight, seconds: float) -> None:
         ("video" if options.is_video else "pictures", written),
     ]
     print_pairs("splatseed flight", rows)
+    add_results(output=options.output, frames=number, sizes=list(ends), seconds=seconds)
 
 
 def _open_models(options: Options) -> list[ViewerItem]:

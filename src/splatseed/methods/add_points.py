@@ -17,7 +17,7 @@ import numpy as np
 
 from splatseed.errors import ParameterError, PointCloudError, SplatseedError
 from splatseed.methods.contract import Made, Upsampler, nothing_finite, traits_of
-from splatseed.methods.registry import chooses_number, source_code
+from splatseed.methods.registry import chooses_number, plugin_fault, source_code
 from splatseed.pointcloud import GENERATED, ORIGINAL, PointCloud
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.runtime.memory import check_memory
@@ -75,14 +75,13 @@ def _call(name: str, method: Any, arguments: tuple[Any, ...], offered: Mapping[s
     except Exception as error:
         if _is_built_in(method) or isinstance(error, MemoryError):
             raise
+        if not isinstance(error, SplatseedError):
+            raise plugin_fault(method, name, error) from error
         file = getattr(sys.modules.get(getattr(method, "__module__", "")), "__file__", None)
         lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == file]
-        where = f"method {name!r}" + (f", line {lines[-1]} of {file}" if lines else "")
-        if isinstance(error, SplatseedError):
-            expected = f"{error.expected}, in {where}"
-            raise type(error)(expected, found=error.found, fix=error.fix) from error
-        found = f"{type(error).__name__}: {error}"
-        raise PointCloudError(f"new points from {where}", found=found, fix=_FIX) from error
+        where = f", line {lines[-1]} of {file}" if lines else ""
+        expected = f"{error.expected}, in method {name!r}{where}"
+        raise type(error)(expected, found=error.found, fix=error.fix) from error
     return made
 
 

@@ -16,16 +16,24 @@ from importlib.metadata import EntryPoint, entry_points
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import MappingProxyType, ModuleType
-from typing import Any, Literal, cast
+from typing import Any, Literal, TypeVar, cast
 
-from splatseed.errors import MissingDependencyError, ParameterError, UnknownNameError
+from splatseed.errors import (
+    MissingDependencyError,
+    ParameterError,
+    PluginError,
+    SplatseedError,
+    UnknownNameError,
+)
 from splatseed.methods.contract import Need, Upsampler, traits_of
 from splatseed.pointcloud import GENERATED, ORIGINAL, PointCloud
 from splatseed.requirements import pip_command
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Scene
 from splatseed.settings import change_settings
-from splatseed.text import did_you_mean
+from splatseed.text import describe_exception, did_you_mean
+
+E = TypeVar("E", bound=SplatseedError)
 
 GROUP = "splatseed.methods"
 OWN_METHOD = (
@@ -74,6 +82,10 @@ class MethodRegistry(Mapping[str, type[Upsampler]]):
             return self._plugins.get(name)
         return EntryPoint(name, name, GROUP)
 
+    def registered(self, value: str) -> EntryPoint | None:
+        """Return the entry point of another package's method at ``value``, MODULE:CLASS."""
+        return next((each for each in self._plugins.values() if each.value == value), None)
+
     def __contains__(self, name: object) -> bool:
         return name in BUILT_IN or self.entry(str(name)) is not None
 
@@ -109,16 +121,29 @@ def _load(entry: EntryPoint) -> type[Upsampler]:
         if not callable(found):
             raise TypeError(f"{name} is {found!r}, which cannot be called")  # noqa: TRY301
     except Exception as error:  # another's code may raise anything
-        expected, fix = f"method {entry.name!r}", "Correct it, or its name."
-        if entry.name != entry.value:  # it is registered
-            package = entry.dist.name if entry.dist else entry.value
-            expected += f", {entry.value} of the package {package},"
-            fix = "Correct the package and install it again, or do without: "
-            fix += f"{pip_command('uninstall', package)}."
-        raise MissingDependencyError(
-            f"{expected} to be imported", found=f"{type(error).__name__}: {error}", fix=fix
-        ) from error
+        raise _fault(MissingDependencyError, entry, "to be imported", error) from error
     return cast("type[Upsampler]", found if isinstance(found, type) else lambda: found)
+
+
+def plugin_fault(method: Any, name: str, error: Exception) -> PluginError:
+    """Return the error that names the package, or the file, of a method that raised another."""
+    value = f"{getattr(method, '__module__', '')}:{type(method).__qualname__}"
+    return _fault(
+        PluginError,
+        METHODS.registered(value) or EntryPoint(name, name, GROUP),
+        "without an exception",
+        error,
+    )
+
+
+def _fault(kind: type[E], entry: EntryPoint, task: str, error: Exception) -> E:
+    expected, fix = f"method {entry.name!r}", "Correct it, or its name."
+    if entry.name != entry.value:  # it is registered
+        package = entry.dist.name if entry.dist else entry.value
+        expected += f", {entry.value} of the package {package},"
+        fix = "Correct the package and install it again, or do without: "
+        fix += f"{pip_command('uninstall', package)}."
+    return kind(f"{expected} {task}", found=describe_exception(error), fix=fix)
 
 
 @cache
@@ -197,6 +222,11 @@ def configure(method: str, profile: Profile = "default", **parameters: Any) -> U
             found=f"{error}",
             fix='Give its fields defaults (docs/methods.md, "Your own method").',
         ) from error
+    except SplatseedError:
+        raise
+    except Exception as error:
+        entry = METHODS.entry(method) or EntryPoint(method, method, GROUP)
+        raise _fault(PluginError, entry, "without an exception", error) from error
     configured: Upsampler = change_settings(chosen, method, parameters)
     return configured
 

@@ -22,10 +22,11 @@ from splatseed.errors import ParameterError
 from splatseed.io import load_scene
 from splatseed.io.files import StrPath, read_text
 from splatseed.io.masks import with_masks
+from splatseed.io.staging import reserved
 from splatseed.photos.loading import user_cache_dir
 from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.view import View, camera_views, view_of
-from splatseed.progress import Note, Progress, silent, silent_note
+from splatseed.progress import Note, Progress, log_note, silent, silent_note
 from splatseed.requirements import require
 from splatseed.scene import MIN_HELD_OUT, Image, Scene
 from splatseed.scores import EvalResult
@@ -116,7 +117,7 @@ def train(
     output: StrPath,
     *,
     on_step: Callable[[int], None] = lambda _: None,
-    note: Note = silent_note,
+    note: Note = log_note,
     progress: Progress = silent,
     **options: Any,
 ) -> Run:
@@ -128,7 +129,7 @@ def train(
             (``seeding="scene"`` keeps them as they are).
         output: The folder of the run.
         on_step: Called after each step with the number of steps done.
-        note: Called with each finding for the user, such as ``print``.
+        note: Called with each finding for the user, such as ``print``; by default they are logged.
         progress: Called with the name of a stage and its fraction done.
         **options: Fields of ``TrainSettings``: ``strategy``, ``max_steps``, ``data_factor``,
             ``seed``, ``test_every``, ``backend``, ``start``, ``exposure``, ``seeding``, ...; and of
@@ -138,7 +139,8 @@ def train(
 
     Raises:
         ParameterError: An option is unknown or out of range, or differs from the resumed run's.
-        OutputError: ``output`` is taken, protected or cannot be written.
+        OutputError: ``output`` is taken, protected or cannot be written, or another process
+            writes it.
         SceneNotFoundError: Fewer than half of the photographs are there.
         SceneFormatError: A camera, a photograph or the run to resume cannot be used.
         PointCloudError: Too few points, or more than fit into memory.
@@ -149,11 +151,12 @@ def train(
         run.metrics["psnr"]
     """
     request = TrainRequest.of(options)
-    training = prepare_training(scene, output, request, note=note, progress=progress)
-    if not training.train(on_step):
-        done = f"stopped after step {training.state.step}, which is kept: pass `resume=True`"
-        raise KeyboardInterrupt(done)
-    training.finish(partial(evaluate_views, progress=progress), progress)
+    with reserved(Path(output)):
+        training = prepare_training(scene, output, request, note=note, progress=progress)
+        if not training.train(on_step):
+            done = f"stopped after step {training.state.step}, which is kept: pass `resume=True`"
+            raise KeyboardInterrupt(done)
+        training.finish(partial(evaluate_views, progress=progress), progress)
     return Run(training.folder.path)
 
 
@@ -197,7 +200,7 @@ def evaluate(
     model: Run | Gaussians | StrPath,
     scene: Scene | StrPath | None = None,
     *,
-    note: Note = silent_note,
+    note: Note = log_note,
     progress: Progress = silent,
     **options: Any,
 ) -> EvalResult:
@@ -207,7 +210,7 @@ def evaluate(
         model: A run, Gaussians in the scene's frame, or the path of a run or of a file of any
             trainer (.ply, .spz, .sog, .splat).
         scene: The scene, or its path; a run knows its own.
-        note: Called with each finding for the user.
+        note: Called with each finding for the user; by default they are logged.
         progress: Called with the name of a stage and its fraction done.
         **options: Fields of ``EvaluateRequest``: ``data_factor`` and ``test_every``, by default as
             the run was trained; ``transform`` from the scene's frame to the model's (a file,

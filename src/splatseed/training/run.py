@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float32
 
 from splatseed.errors import OutputError, PointCloudError
+from splatseed.findings import LOGGER
 from splatseed.io.staging import write_json
 from splatseed.photos.view import View
 from splatseed.progress import Progress, silent
@@ -173,6 +174,8 @@ class TrainingRun:
                     self._board.add_scalar(name, value, record.step)
         if record.test_psnr is None and self._test_views:
             return
+        shown = record.step, record.train_psnr, record.test_psnr, record.num_gaussians
+        LOGGER.debug("step %d: PSNR %.2f dB, of test views %.2f dB, %d Gaussians", *shown)
         write_curve_csv(self.folder.curve_csv, self.state.records)
         if self._saved_step is None or time.monotonic() - self._saved > CHECKPOINT_SECONDS:
             self._save()
