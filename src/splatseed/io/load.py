@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -30,8 +31,10 @@ from splatseed.io.depth_maps import (
 )
 from splatseed.io.files import StrPath, is_video, special_kind
 from splatseed.io.llff import is_llff, read_llff
+from splatseed.io.metashape import find_metashape, read_metashape
 from splatseed.io.nerfstudio import is_blender, read_blender, read_transforms_scene
 from splatseed.io.origin import recentered
+from splatseed.io.photogrammetry import largest
 from splatseed.io.picture import find_white
 from splatseed.io.ply import read_ply_float64, refuse_gaussians
 from splatseed.io.polycam import is_polycam, read_polycam
@@ -66,6 +69,27 @@ class Reader(NamedTuple):
     read: Callable[[Path], Scene]
 
 
+class Export(NamedTuple):
+    """A format of one file of cameras, of which a folder may hold several."""
+
+    files: str  # by which it is recognised, for messages
+    find: Callable[[Path], list[Path]]  # in a folder
+    read: Callable[[Path, Path], Scene]  # of a file and its scene's folder
+
+    def recognises(self, folder: Path) -> bool:
+        """Whether a folder has such a file."""
+        with suppress(OSError):  # one that may not be listed is no scene
+            return bool(self.find(folder))
+        return False
+
+    def read_folder(self, folder: Path) -> Scene:
+        """Read the largest file of a folder."""
+        path, findings = largest(self.find(folder))
+        scene = self.read(path, folder)
+        return scene.replace(findings=(*findings, *scene.findings))
+
+
+EXPORTS = (Export("Metashape's .xml", find_metashape, read_metashape),)
 READERS = (
     Reader("poses_bounds.npy", is_llff, read_llff),
     Reader("traj.txt", is_replica, load_rgbd),
@@ -74,6 +98,7 @@ READERS = (
     Reader("Polycam's keyframes", is_polycam, read_polycam),
     Reader("Record3D's EXR_RGBD", is_record3d, read_record3d),
     Reader("Stray Scanner's rgb.mp4 with odometry.csv", is_stray, read_stray),
+    *(Reader(each.files, each.recognises, each.read_folder) for each in EXPORTS),
 )
 """Tried in this order, after COLMAP models and transforms.json."""
 _INCOMPLETE = (
@@ -217,6 +242,9 @@ def _read_file(path: Path) -> Scene:
         points, exact = read_ply_float64(path)
         source = SceneSource("ply", path.parent, path)
         return recentered(Scene(points, source=source), exact)
+    for each in EXPORTS:
+        if path in each.find(path.parent):
+            return each.read(path, path.parent)
     if suffix == ".json":
         return read_transforms_scene(path)
     if _is_archive(path):
