@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.ply import write_ply
+from splatseed.lens import project_rays
 from splatseed.pointcloud import PointCloud
 
 from .exports import SIZE, check_projections, kinds, load, made_cameras, write_photographs
@@ -108,8 +109,6 @@ def test_what_colmap_cannot_express_is_stated(tmp_path):
         expected = manual(made.rays(i), lens)
         inside = ((expected > 0) & (expected < SIZE)).all(axis=1)
         rays = made.rays(i)
-        from splatseed.lens import project_rays
-
         seen = project_rays(image.intrinsics, rays[:, :2] / rays[:, 2:])
         assert np.abs(seen - expected)[inside].max() < 1e-3
     write(root, made, [sensor(0, {"f": 80.0, "b2": 0.5})], NAMES)

@@ -38,6 +38,7 @@ from splatseed.io.photogrammetry import largest
 from splatseed.io.picture import find_white
 from splatseed.io.ply import read_ply_float64, refuse_gaussians
 from splatseed.io.polycam import is_polycam, read_polycam
+from splatseed.io.realityscan import find_realityscan, read_realityscan
 from splatseed.io.record3d import (
     ARCHIVE,
     find_recorded_depths,
@@ -89,7 +90,10 @@ class Export(NamedTuple):
         return scene.replace(findings=(*findings, *scene.findings))
 
 
-EXPORTS = (Export("Metashape's .xml", find_metashape, read_metashape),)
+EXPORTS = (
+    Export("Metashape's .xml", find_metashape, read_metashape),
+    Export("RealityScan's .csv", find_realityscan, read_realityscan),
+)
 READERS = (
     Reader("poses_bounds.npy", is_llff, read_llff),
     Reader("traj.txt", is_replica, load_rgbd),

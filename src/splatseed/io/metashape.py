@@ -32,10 +32,10 @@ from splatseed.io.photogrammetry import (
     EXPORT_AGAIN,
     Export,
     Shot,
-    approximate_radial,
     begins_with,
     ignored,
     make_scene,
+    with_r8,
 )
 from splatseed.io.photograph_checks import Size
 from splatseed.scene import OPENCV, Scene
@@ -158,9 +158,7 @@ def _lens(
         findings.append(ignored("The change p3, p4 of tangential terms", moved, where))
     if kind in _FISHEYES:
         return fisheye(focal, center, (k1, k2, k3, k4), (p2, p1)), findings
-    lens = brown(focal, center, (k1, k2, k3), (p2, p1))
-    lens, found = approximate_radial(lens, k4, size, where)
-    return lens, [*findings, *found]
+    return with_r8(brown(focal, center, (k1, k2, k3), (p2, p1)), k4), findings
 
 
 def _numbers(where: str, element: _Element, count: int) -> Float64[np.ndarray, " N"]:

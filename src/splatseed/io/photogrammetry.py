@@ -46,6 +46,8 @@ _NO_PHOTOGRAPHS = ("mask", "depth", "normal", "segment")
 """Parts of the names of folders whose pictures are no photographs."""
 _GAUSSIANS = b"f_dc_0"
 """A property of a PLY file of Gaussians, which are no points to start from."""
+_R8 = "BROWN_R8"
+"""Brown's model with a term of r^8: fx fy cx cy k1 k2 p1 p2 k3 k4. COLMAP has none."""
 _GREY = 128
 """Of points without a colour."""
 _MAX_ERROR = 0.1
@@ -79,39 +81,44 @@ class Export:
     findings: Sequence[Finding] = ()
 
 
-def approximate_radial(lens: Lens, k4: float, size: Size, what: str) -> tuple[Lens, list[Finding]]:
-    """Add a term of r^8 to a lens of ``brown``, which COLMAP's models lack, within the image.
+def with_r8(lens: Lens, k4: float) -> Lens:
+    """Add a term of r^8 to a lens of ``brown``: a model that ``make_scene`` approximates."""
+    terms = (*lens[1][4:], 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
+    return (_R8, (*lens[1][:4], *terms, k4)) if k4 else lens
 
-    FULL_OPENCV's ratio of polynomials in r^2 is fitted to the sum of four terms. ``what`` is
-    named in the finding that states the largest error.
-    """
-    if not k4:
-        return lens, []
-    (fx, fy, cx, cy), terms = lens[1][:4], (*lens[1][4:], 0.0, 0.0, 0.0, 0.0, 0.0)
-    k1, k2, p1, p2, k3 = terms[:5]
+
+def _without_r8(lens: Lens, size: Size) -> tuple[Lens, float]:
+    """Fit FULL_OPENCV's ratio of polynomials in r^2 within the image; return its error in px."""
+    if lens[0] != _R8:
+        return lens, 0.0
+    fx, fy, cx, cy, k1, k2, p1, p2, k3, k4 = lens[1]
     corner = np.hypot(max(cx, size[0] - cx) / fx, max(cy, size[1] - cy) / fy)
     r = np.linspace(0, 2 * corner, 4001)
     t = r * r
     radial = 1 + t * (k1 + t * (k2 + t * (k3 + t * k4)))
     beyond = (r * radial > corner) | (np.gradient(r * radial, r) <= 0)
     used = slice(0, int(beyond.argmax()) or len(r))
-    t, radial = t[used], radial[used]
-    # numerator - radial * (denominator - 1) = radial, linear in the six coefficients
-    powers = np.stack([t, t**2, t**3], axis=1)
-    scale = np.abs(powers).max(axis=0)
-    system = np.hstack([powers / scale, -radial[:, None] * powers / scale])
-    # The displacement counts, so rows weigh as their radius.
-    weights = r[used, None]
-    solution = np.linalg.lstsq(system * weights, (radial - 1) * weights[:, 0], rcond=1e-12)[0]
-    a, b = solution[:3] / scale, solution[3:] / scale
+    r, t, radial = r[used, None], t[used, None], radial[used, None]
+    # numerator - radial * (denominator - 1) = radial is linear in the six coefficients. The
+    # displacement counts, so that equations weigh as their radius.
+    powers = (t / t[-1]) ** [1, 2, 3]
+    system = np.hstack([powers, -radial * powers])
+    solution = np.linalg.lstsq(system * r, ((radial - 1) * r)[:, 0], rcond=1e-12)[0]
+    a, b = solution.reshape(2, 3)
     fitted = (1 + powers @ a) / (1 + powers @ b)
-    error = float(max(fx, fy) * (np.abs(fitted - radial) * r[used]).max())
-    params = (fx, fy, cx, cy, a[0], a[1], p1, p2, a[2], b[0], b[1], b[2])
+    error = float(max(fx, fy) * (np.abs(fitted[:, None] - radial) * r).max())
+    a, b = (each / t[-1] ** [1, 2, 3] for each in (a, b))
+    params = (fx, fy, cx, cy, a[0], a[1], p1, p2, a[2], *b)
+    return ("FULL_OPENCV", tuple(map(float, params))), error
+
+
+def _approximated(count: int, error: float) -> list[Finding]:
+    if not count:
+        return []
     severity: Severity = "info" if error <= _MAX_ERROR else "warning"
-    text = f"The term of r^8 of {what}, which COLMAP's models lack, is approximated"
-    text += f" by FULL_OPENCV within {error:.2g} px."
-    finding = Finding("approximated-distortion", text, severity, (what,))
-    return ("FULL_OPENCV", tuple(map(float, params))), [finding]
+    text = f"The terms of r^8 of {counted(count, 'camera')}, which COLMAP's models lack, are"
+    text += f" approximated by FULL_OPENCV within {error:.2g} px."
+    return [Finding("approximated-distortion", text, severity)]
 
 
 def ignored(term: str, pixels: float, what: str) -> Finding:
@@ -172,6 +179,7 @@ def make_scene(export: Export, root: Path) -> Scene:
         root = folder.parent  # the export lies in a folder beside the photographs
     cameras: dict[tuple[Lens, Size], Intrinsics] = {}
     images, unusable, lost = dict[str, Image](), dict[str, NotFiniteError](), list[str]()
+    errors = list[float]()  # of approximated lenses, px
     for i, shot in enumerate(shots):
         name = files.get(shot.name, "" if shot.name in ambiguous else _relative(shot.name))
         if not name or name in images or (shot.size is None and shot.name not in files):
@@ -181,10 +189,10 @@ def make_scene(export: Export, root: Path) -> Scene:
             size = shot.size or photograph_size(Path(folder or root, name))
             lens = shot.lens(size)
             if (lens, size) not in cameras:
+                (model, params), error = _without_r8(lens, size)
+                errors += [error] if model != lens[0] else []
                 camera_id = len(cameras) + 1
-                cameras[lens, size] = make_intrinsics(
-                    shot.where, camera_id, lens[0], *size, lens[1]
-                )
+                cameras[lens, size] = make_intrinsics(shot.where, camera_id, model, *size, params)
             finite = bool(np.isfinite(shot.world_from_cam).all())
             require_finite(finite, "a finite pose", shot.where, "NaN or infinity")
             pose = rigid_pose(shot.where, shot.world_from_cam)
@@ -202,6 +210,7 @@ def make_scene(export: Export, root: Path) -> Scene:
     points, found = _points(export, root)
     findings = (
         *export.findings,
+        *_approximated(len(errors), max(errors, default=0.0)),
         *left_out("disabled-cameras", "disabled photograph", "use", export.disabled),
         *left_out("missing-poses", "photograph", "a pose", export.unposed),
         *left_out("missing-photographs", "image", "a photograph of its own", lost),
