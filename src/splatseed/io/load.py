@@ -33,6 +33,7 @@ from splatseed.io.files import StrPath, is_video, special_kind
 from splatseed.io.llff import is_llff, read_llff
 from splatseed.io.metashape import find_metashape, read_metashape
 from splatseed.io.nerfstudio import is_blender, read_blender, read_transforms_scene
+from splatseed.io.opensfm import find_opensfm, read_opensfm
 from splatseed.io.origin import recentered
 from splatseed.io.photogrammetry import largest
 from splatseed.io.picture import find_white
@@ -93,6 +94,7 @@ class Export(NamedTuple):
 EXPORTS = (
     Export("Metashape's .xml", find_metashape, read_metashape),
     Export("RealityScan's .csv", find_realityscan, read_realityscan),
+    Export("OpenSfM's reconstruction.json", find_opensfm, read_opensfm),
 )
 READERS = (
     Reader("poses_bounds.npy", is_llff, read_llff),

@@ -4,8 +4,7 @@ A list of reconstructions with ``cameras``, ``shots`` and ``points``. A shot has
 and the translation of ``cam_from_world`` in OpenCV axes, and is named as its photograph. Cameras
 count in units of the longer side, from the image centre. Models: perspective, simple_radial,
 radial and brown (OpenCV's k1, k2, p1, p2, k3); fisheye and fisheye_opencv (equidistant, k1 to k4
-of theta^2 to theta^8), fisheye62 and fisheye624 (k1 to k6, p1, p2 and a thin prism). Sources:
-OpenSfM's "Geometric Models" and "Reconstruction file format", and its ``opensfm/io.py``.
+of theta^2 to theta^8). Sources: OpenSfM's "Geometric Models" and ``opensfm/io.py``.
 """
 
 from __future__ import annotations
@@ -16,9 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from splatseed.camera import PANORAMA
+from splatseed.camera import PANORAMA, rotation_from_quat
 from splatseed.errors import SceneFormatError
 from splatseed.findings import Finding
 from splatseed.io.camera_records import Lens, brown, fisheye, format_error
@@ -32,8 +30,6 @@ _NAME = "reconstruction.json"
 _CONVENTION = f"each shot has the rotation vector and translation of cam_from_world, {OPENCV}"
 _PERSPECTIVE = frozenset({"perspective", "simple_radial", "radial", "brown"})
 _FISHEYE = frozenset({"fisheye", "fisheye_opencv"})
-_ROTATED_TERMS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-_PRISM = ("s0", "s1", "s2", "s3")
 
 
 def find_opensfm(folder: Path) -> list[Path]:
@@ -64,10 +60,18 @@ def _read(path: Path) -> Export:
     for name, shot in chosen["shots"].items():
         where, camera = f"{path}, shot {name}", chosen["cameras"][shot["camera"]]
         size = int(camera["width"]), int(camera["height"])
-        rotation = Rotation.from_rotvec(np.array(shot["rotation"], np.float64)).as_matrix().T
+        vector = np.array(shot["rotation"], np.float64).reshape(3)
+        half = np.linalg.norm(vector) / 2
+        # sin(half) / (2 half), also where the vector is 0
+        quat = np.array([np.cos(half), *(np.sinc(half / np.pi) / 2 * vector)])
+        rotation = rotation_from_quat(quat).T
         center = -rotation @ np.array(shot["translation"], np.float64)
         lens = partial(_lens, f"{path}, camera {shot['camera']}", camera)
-        shots.append(Shot(where, name, size, lens, np.column_stack([rotation, center])))
+        shots.append(
+            Shot(
+                where, name, size if all(size) else None, lens, np.column_stack([rotation, center])
+            )
+        )
     points = chosen.get("points", {}).values()
     cloud = points_of(
         [point["coordinates"] for point in points],
@@ -88,15 +92,11 @@ def _lens(where: str, camera: Mapping[str, Any], size: Size) -> Lens:
         raise format_error("focal or focal_x", where, "neither")
     focal = float(f) * side, float(camera.get("focal_y", f)) * side
     center = size[0] / 2 + number("c_x") * side, size[1] / 2 + number("c_y") * side
-    k1, k2, k3, k4, k5, k6, p1, p2 = map(number, _ROTATED_TERMS)
+    k1, k2, k3, k4, p1, p2 = map(number, ("k1", "k2", "k3", "k4", "p1", "p2"))
     if kind in _PERSPECTIVE:
         return brown(focal, center, (k1, k2, k3), (p1, p2))
     if kind in _FISHEYE:
         return fisheye(focal, center, (k1, k2, k3, k4))
-    if kind in {"fisheye62", "fisheye624"}:
-        radial, prism = (k1, k2, k3, k4, k5, k6), map(number, _PRISM)
-        # COLMAP numbers p1 and p2 as Project Aria does: in reverse.
-        return "RAD_TAN_THIN_PRISM_FISHEYE", (*focal, *center, *radial, p2, p1, *prism)
     raise SceneFormatError(
         f"a perspective or fisheye projection_type in {where}",
         found=repr(kind),
