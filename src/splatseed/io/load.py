@@ -16,6 +16,7 @@ from typing import NamedTuple
 from splatseed.depthmap import DepthKind
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError, SplatseedError
 from splatseed.findings import Finding, without_kinds
+from splatseed.io.bundler import find_bundler, read_bundler
 from splatseed.io.cleaning import clean_scene, outlier_findings
 from splatseed.io.colmap_model import find_model, nested_model, read_model, scene_model, scene_root
 from splatseed.io.copies import without_copies
@@ -95,6 +96,7 @@ EXPORTS = (
     Export("Metashape's .xml", find_metashape, read_metashape),
     Export("RealityScan's .csv", find_realityscan, read_realityscan),
     Export("OpenSfM's reconstruction.json", find_opensfm, read_opensfm),
+    Export("Bundler's .out", find_bundler, read_bundler),
 )
 READERS = (
     Reader("poses_bounds.npy", is_llff, read_llff),
