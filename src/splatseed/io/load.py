@@ -34,6 +34,7 @@ from splatseed.io.files import StrPath, is_video, special_kind
 from splatseed.io.llff import is_llff, read_llff
 from splatseed.io.metashape import find_metashape, read_metashape
 from splatseed.io.nerfstudio import is_blender, read_blender, read_transforms_scene
+from splatseed.io.openmvg import find_openmvg, read_openmvg
 from splatseed.io.opensfm import find_opensfm, read_opensfm
 from splatseed.io.origin import recentered
 from splatseed.io.photogrammetry import largest
@@ -97,6 +98,7 @@ EXPORTS = (
     Export("RealityScan's .csv", find_realityscan, read_realityscan),
     Export("OpenSfM's reconstruction.json", find_opensfm, read_opensfm),
     Export("Bundler's .out", find_bundler, read_bundler),
+    Export("OpenMVG's sfm_data.json", find_openmvg, read_openmvg),
 )
 READERS = (
     Reader("poses_bounds.npy", is_llff, read_llff),

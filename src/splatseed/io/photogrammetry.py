@@ -30,7 +30,7 @@ from splatseed.io.camera_records import (
     unusable_findings,
 )
 from splatseed.io.colmap_model import IMAGE_DIRS
-from splatseed.io.files import IMAGE_SUFFIXES, files_below, is_hidden, open_file
+from splatseed.io.files import IMAGE_SUFFIXES, files_below, is_hidden, open_file, translate_errors
 from splatseed.io.mask_files import masks_among
 from splatseed.io.origin import recentered
 from splatseed.io.photograph import lens_findings
@@ -187,7 +187,8 @@ def make_scene(export: Export, root: Path) -> Scene:
             continue
         try:
             size = shot.size or photograph_size(Path(folder or root, name))
-            lens = shot.lens(size)
+            with translate_errors(track, "a file of cameras", fix=EXPORT_AGAIN):
+                lens = shot.lens(size)
             if (lens, size) not in cameras:
                 (model, params), error = _without_r8(lens, size)
                 errors += [error] if model != lens[0] else []
