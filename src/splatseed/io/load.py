@@ -32,6 +32,7 @@ from splatseed.io.depth_maps import (
 )
 from splatseed.io.files import StrPath, is_video, special_kind
 from splatseed.io.llff import is_llff, read_llff
+from splatseed.io.meshroom import find_meshroom, read_meshroom
 from splatseed.io.metashape import find_metashape, read_metashape
 from splatseed.io.nerfstudio import is_blender, read_blender, read_transforms_scene
 from splatseed.io.openmvg import find_openmvg, read_openmvg
@@ -99,6 +100,7 @@ EXPORTS = (
     Export("OpenSfM's reconstruction.json", find_opensfm, read_opensfm),
     Export("Bundler's .out", find_bundler, read_bundler),
     Export("OpenMVG's sfm_data.json", find_openmvg, read_openmvg),
+    Export("Meshroom's .sfm", find_meshroom, read_meshroom),
 )
 READERS = (
     Reader("poses_bounds.npy", is_llff, read_llff),
