@@ -51,7 +51,7 @@ def write_photographs(folder: Path, names, size=SIZE):
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         pixels = np.full((size[1], size[0], 3), 90, np.uint8)
-        pixels[0, 0] = i, len(name), 7
+        pixels[:, : len(pixels[0]) // 2] = 20 * i, len(name), 7
         PilImage.fromarray(pixels).save(path)
 
 

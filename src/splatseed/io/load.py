@@ -42,6 +42,7 @@ from splatseed.io.photogrammetry import largest
 from splatseed.io.picture import find_white
 from splatseed.io.ply import read_ply_float64, refuse_gaussians
 from splatseed.io.polycam import is_polycam, read_polycam
+from splatseed.io.pose_files import is_pose_folder, read_pose_folder
 from splatseed.io.realityscan import find_realityscan, read_realityscan
 from splatseed.io.record3d import (
     ARCHIVE,
@@ -52,6 +53,7 @@ from splatseed.io.record3d import (
     read_record3d,
 )
 from splatseed.io.rgbd import find_tum_depths, is_replica, is_tum, load_rgbd, load_tum
+from splatseed.io.rtabmap import find_rtabmap, read_rtabmap
 from splatseed.io.scanner_app import is_scanner_app, read_scanner_app
 from splatseed.io.seeds import recall_seeds, restore_absent, with_recorded_masks
 from splatseed.io.split import with_listed_split
@@ -101,6 +103,7 @@ EXPORTS = (
     Export("Bundler's .out", find_bundler, read_bundler),
     Export("OpenMVG's sfm_data.json", find_openmvg, read_openmvg),
     Export("Meshroom's .sfm", find_meshroom, read_meshroom),
+    Export("RTAB-Map's _camera_poses.txt", find_rtabmap, read_rtabmap),
 )
 READERS = (
     Reader("poses_bounds.npy", is_llff, read_llff),
@@ -111,6 +114,7 @@ READERS = (
     Reader("Record3D's EXR_RGBD", is_record3d, read_record3d),
     Reader("Stray Scanner's rgb.mp4 with odometry.csv", is_stray, read_stray),
     *(Reader(each.files, each.recognises, each.read_folder) for each in EXPORTS),
+    Reader("frame-000000.pose.txt, or ScanNet's pose with color", is_pose_folder, read_pose_folder),
 )
 """Tried in this order, after COLMAP models and transforms.json."""
 _INCOMPLETE = (

@@ -77,6 +77,7 @@ class Export:
     convention: str  # ``SceneSource.convention``
     unposed: Sequence[str] = ()  # names of photographs that have no pose
     disabled: Sequence[str] = ()  # names of those that the user has disabled
+    folder: Path | None = None  # of the photographs, if shots have their exact names
     points: Points | None = None  # None: those of a PLY file beside it
     findings: Sequence[Finding] = ()
 
@@ -174,7 +175,10 @@ def make_scene(export: Export, root: Path) -> Scene:
             found=f"{len(export.unposed) + len(export.disabled) or 'none'} without a pose",
             fix=EXPORT_AGAIN,
         )
-    folder, files, ambiguous = find_photographs(root, [shot.name for shot in shots])
+    names, ambiguous = [shot.name for shot in shots], set[str]()
+    folder, files = export.folder, {name: name for name in names}
+    if folder is None:
+        folder, files, ambiguous = find_photographs(root, names)
     if folder is not None and folder.parent == root.absolute().parent:
         root = folder.parent  # the export lies in a folder beside the photographs
     cameras: dict[tuple[Lens, Size], Intrinsics] = {}
@@ -348,7 +352,7 @@ def _first(index: Mapping[str, list[str]], tails: Iterable[str]) -> tuple[list[s
 
 def _unlisted(folder: Path | None, names: Sequence[str], export: Export) -> list[Finding]:
     """Report photographs beside those of the export that it does not have."""
-    if folder is None:
+    if folder is None or folder == export.folder:
         return []
     used = {*names}
     places = {PurePosixPath(name).parent for name in used}
