@@ -1,9 +1,10 @@
 """RTAB-Map: what ``rtabmap-export --images_id --poses_camera NAME.db`` writes.
 
-``NAME_camera_poses.txt`` has a line per node, ``timestamp x y z qx qy qz qw id``: ``world_from_cam``
-in OpenCV axes, metres, z up. ``NAME_rgb/ID.jpg`` are the photographs (with ``--images`` they are
-named by the time stamp), ``NAME_calib/ID.yaml`` their cameras as OpenCV writes them, pixels from the
-centre of the first, and ``NAME_depth/ID.png`` planar z in millimetres. Sources: RTAB-Map's
+``NAME_camera_poses.txt`` has a line per node, ``timestamp x y z qx qy qz qw id``:
+``world_from_cam`` in OpenCV axes, metres, z up. ``NAME_rgb/ID.jpg`` are the photographs (with
+``--images`` they are named by the time stamp), ``NAME_calib/ID.yaml`` their cameras as OpenCV
+writes them, pixels from the centre of the first, and ``NAME_depth/ID.png`` planar z in millimetres.
+Sources: RTAB-Map's
 ``tools/Export/main.cpp``, ``corelib/src/Graph.cpp`` and ``CameraModel.cpp``.
 """
 
@@ -20,7 +21,7 @@ from splatseed.camera import rotation_from_quat
 from splatseed.errors import SceneFormatError
 from splatseed.io.camera_records import Lens, brown, check_unit_quat, fisheye, format_error
 from splatseed.io.depth_maps import DepthFiles
-from splatseed.io.files import image_names, is_data, numbered_lines, read_text, translate_errors
+from splatseed.io.files import image_names, is_data, numbered_lines, read_bytes, translate_errors
 from splatseed.io.photogrammetry import EXPORT_AGAIN, Export, Shot, begins_with, make_scene
 from splatseed.io.photograph_checks import Size
 from splatseed.scene import OPENCV, Scene
@@ -80,7 +81,7 @@ def _record(where: str, fields: list[str]) -> tuple[str, Float64[np.ndarray, "3 
 
 def _lens(path: Path, size: Size) -> Lens:
     with translate_errors(path, "the camera of a photograph, as OpenCV's YAML", fix=EXPORT_AGAIN):
-        text = read_text(path)
+        text = read_bytes(path).decode("utf-8")
         width, height = (int(_field(text, key)) for key in ("image_width", "image_height"))
         fx, _, cx, _, fy, cy, *_ = _numbers(text, "camera_matrix")
         terms = _numbers(text, "distortion_coefficients")
