@@ -79,6 +79,7 @@ def test_projections_are_those_of_the_geometric_models(tmp_path, place):
     for path in dict.fromkeys((root, root / place, (root / place).parent)):
         read = load(path)
         assert (read.source.format, kinds(read)) == ("opensfm", {"lens-distortion"})
+        assert (read.source.root, read.source.image_dir) == (root, root / "images")
         assert [image.intrinsics.model for image in read.images] == [
             "FULL_OPENCV", "OPENCV", "OPENCV_FISHEYE", "OPENCV_FISHEYE"
         ]  # fmt: skip

@@ -56,7 +56,7 @@ def test_projections_are_those_of_the_camera_math(tmp_path, size):
     for path in (root, root / "cameras.csv"):
         read = load(path)
         assert (read.source.format, kinds(read)) == ("realityscan", {"lens-distortion"})
-        assert read.source.image_dir == root
+        assert (read.source.image_dir, read.source.root) == (root, root)
         check_projections(
             read, made, [camera_math(made.rays(i), LENS, size) for i in range(4)], NAMES
         )

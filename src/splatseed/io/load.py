@@ -83,11 +83,15 @@ class Export(NamedTuple):
     find: Callable[[Path], list[Path]]  # in a folder
     read: Callable[[Path, Path], Scene]  # of a file and its scene's folder
 
+    def files_in(self, folder: Path) -> list[Path]:
+        """List such files; none where a folder or file may not be read."""
+        with suppress(OSError):
+            return self.find(folder)
+        return []
+
     def recognises(self, folder: Path) -> bool:
         """Whether a folder has such a file."""
-        with suppress(OSError):  # one that may not be listed is no scene
-            return bool(self.find(folder))
-        return False
+        return bool(self.files_in(folder))
 
     def read_folder(self, folder: Path) -> Scene:
         """Read the largest file of a folder."""
@@ -143,10 +147,11 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
         path: A folder with a COLMAP model (in ``sparse/0``, ``sparse``, ``colmap/sparse/0``, the
             folder itself or its subfolder ``0``), ``transforms.json``, ``transforms_train.json``
             and ``transforms_test.json``, LLFF's ``poses_bounds.npy``, an RGB-D capture
-            (``traj.txt``, or ``rgb.txt`` and ``groundtruth.txt``), or the export of a phone app
-            (3D Scanner App's ``frame_00000.json``, Polycam's ``keyframes``, Record3D's
-            ``EXR_RGBD``, Stray Scanner's ``rgb.mp4`` and ``odometry.csv``); or a ``.json``,
-            ``.ply`` or ``.r3d`` file (Record3D's).
+            (``traj.txt``, or ``rgb.txt`` and ``groundtruth.txt``, or a file per pose), the export
+            of a phone app (3D Scanner App's ``frame_00000.json``, Polycam's ``keyframes``,
+            Record3D's ``EXR_RGBD``, Stray Scanner's ``rgb.mp4`` and ``odometry.csv``), or a file of
+            cameras of Metashape, RealityScan, OpenSfM, Bundler, OpenMVG, Meshroom or RTAB-Map; or
+            that file, or a ``.json``, ``.ply`` or ``.r3d`` file (Record3D's).
             ``sparse`` takes precedence over ``transforms.json`` (except in an output of splatseed
             that has both), and that over ``colmap/sparse/0``.
         require_points: Raise for a scene without points; if False, its cloud is empty.
@@ -259,7 +264,7 @@ def _read_file(path: Path) -> Scene:
         source = SceneSource("ply", path.parent, path)
         return recentered(Scene(points, source=source), exact)
     for each in EXPORTS:
-        if path in each.find(path.parent):
+        if suffix != ".ply" and path in each.files_in(path.parent):
             return each.read(path, path.parent)
     if suffix == ".json":
         return read_transforms_scene(path)

@@ -38,7 +38,7 @@ _Record = Mapping[str, Any]
 
 def find_openmvg(folder: Path) -> list[Path]:
     """List OpenMVG's scenes in a folder."""
-    return begins_with(folder, "*.json", _HEAD)
+    return begins_with(folder, "*sfm*.json", _HEAD)
 
 
 def read_openmvg(path: Path, root: Path) -> Scene:

@@ -135,7 +135,8 @@ def points_of(
     exact = np.array([*xyz], np.float64).reshape(-1, 3)
     colors = np.full(exact.shape, _GREY, np.uint8)
     if rgb is not None:
-        colors = np.clip(np.array([*rgb], np.float64), 0, 255).reshape(-1, 3).astype(np.uint8)
+        stored = np.nan_to_num(np.array([*rgb], np.float64).reshape(-1, 3))
+        colors = np.clip(stored, 0, 255).astype(np.uint8)
     with np.errstate(over="ignore"):  # beyond float32's range: infinite, dropped later
         return PointCloud(exact.astype(np.float32), colors), exact, path
 
@@ -179,7 +180,7 @@ def make_scene(export: Export, root: Path) -> Scene:
     folder, files = export.folder, {name: name for name in names}
     if folder is None:
         folder, files, ambiguous = find_photographs(root, names)
-    if folder is not None and folder.parent == root.absolute().parent:
+    if folder and folder != root and folder.parent == root.absolute().parent:
         root = folder.parent  # the export lies in a folder beside the photographs
     cameras: dict[tuple[Lens, Size], Intrinsics] = {}
     images, unusable, lost = dict[str, Image](), dict[str, NotFiniteError](), list[str]()

@@ -55,8 +55,7 @@ def read_pose_folder(root: StrPath) -> Scene:
     names = [name for name in image_names(folder) if Path(name).stem.endswith(marks[0])]
     posed = {name: files.get(Path(name).stem.removesuffix(marks[0])) for name in names}
     if not any(posed.values()):
-        path = next(iter(sorted(files.values())))
-        example = path.name.removesuffix(f"{marks[1]}.txt") + f"{marks[0]}.jpg"
+        example = min(files.values()).name.removesuffix(f"{marks[1]}.txt") + f"{marks[0]}.jpg"
         raise SceneNotFoundError(
             f"photographs in {folder}, such as {example}",
             found=f"none for {counted(len(files), 'pose')}",
