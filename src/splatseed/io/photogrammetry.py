@@ -23,6 +23,7 @@ from splatseed.io.camera_records import (
     Lens,
     NotFiniteError,
     check_enough,
+    check_record,
     left_out,
     make_intrinsics,
     require_finite,
@@ -88,18 +89,23 @@ def with_r8(lens: Lens, k4: float) -> Lens:
     return (_R8, (*lens[1][:4], *terms, k4)) if k4 else lens
 
 
-def _without_r8(lens: Lens, size: Size) -> tuple[Lens, float]:
+def _without_r8(where: str, lens: Lens, size: Size) -> tuple[Lens, float]:
     """Fit FULL_OPENCV's ratio of polynomials in r^2 within the image; return its error in px."""
     if lens[0] != _R8:
         return lens, 0.0
     fx, fy, cx, cy, k1, k2, p1, p2, k3, k4 = lens[1]
-    corner = np.hypot(max(cx, size[0] - cx) / fx, max(cy, size[1] - cy) / fy)
-    r = np.linspace(0, 2 * corner, 4001)
-    t = r * r
-    radial = 1 + t * (k1 + t * (k2 + t * (k3 + t * k4)))
-    beyond = (r * radial > corner) | (np.gradient(r * radial, r) <= 0)
+    if not (np.isfinite(lens[1]).all() and min(fx, fy) > 0):
+        return ("OPENCV", lens[1][:8]), 0.0  # which its check refuses
+    with np.errstate(all="ignore"):  # checked below
+        corner = np.hypot(max(cx, size[0] - cx) / fx, max(cy, size[1] - cy) / fy)
+        r = np.linspace(0, 2 * corner, 4001)
+        t = r * r
+        radial = 1 + t * (k1 + t * (k2 + t * (k3 + t * k4)))
+        beyond = (r * radial > corner) | (np.gradient(r * radial, r) <= 0)
     used = slice(0, int(beyond.argmax()) or len(r))
     r, t, radial = r[used, None], t[used, None], radial[used, None]
+    plausible = 1e-6 < t[-1, 0] < 1e6 and np.abs(radial).max() < 1e6  # not NaN either
+    require_finite(bool(plausible), "a lens that does not fold", where, lens[1])
     # numerator - radial * (denominator - 1) = radial is linear in the six coefficients. The
     # displacement counts, so that equations weigh as their radius.
     powers = (t / t[-1]) ** [1, 2, 3]
@@ -176,6 +182,8 @@ def make_scene(export: Export, root: Path) -> Scene:
             found=f"{len(export.unposed) + len(export.disabled) or 'none'} without a pose",
             fix=EXPORT_AGAIN,
         )
+    for shot in shots:
+        check_record(_is_name(shot.name), "the name of a photograph", shot.where, repr(shot.name))
     names, ambiguous = [shot.name for shot in shots], set[str]()
     folder, files = export.folder, {name: name for name in names}
     if folder is None:
@@ -195,7 +203,7 @@ def make_scene(export: Export, root: Path) -> Scene:
             with translate_errors(track, "a file of cameras", fix=EXPORT_AGAIN):
                 lens = shot.lens(size)
             if (lens, size) not in cameras:
-                (model, params), error = _without_r8(lens, size)
+                (model, params), error = _without_r8(shot.where, lens, size)
                 errors += [error] if model != lens[0] else []
                 camera_id = len(cameras) + 1
                 cameras[lens, size] = make_intrinsics(shot.where, camera_id, model, *size, params)
@@ -342,6 +350,10 @@ def _matched(names: Sequence[str], files: Sequence[str]) -> tuple[dict[str, str]
     return kept, ambiguous | (matched.keys() - kept.keys())
 
 
+def _is_name(name: object) -> bool:
+    return isinstance(name, str) and bool(PurePosixPath(name).name)
+
+
 def _is_image(name: str) -> bool:
     return PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES
 
@@ -358,7 +370,8 @@ def _unlisted(folder: Path | None, names: Sequence[str], export: Export) -> list
     used = {*names}
     places = {PurePosixPath(name).parent for name in used}
     there = [file for file in image_files(folder) if PurePosixPath(file).parent in places]
-    without, doubtful = _matched([*export.unposed, *export.disabled], there)
+    others = [name for name in (*export.unposed, *export.disabled) if _is_name(name)]
+    without, doubtful = _matched(others, there)
     unlisted = [file for file in there if file not in used and file not in {*without.values()}]
     if doubtful:
         return []

@@ -74,8 +74,9 @@ def _record(where: str, fields: list[str]) -> tuple[str, Float64[np.ndarray, "3 
     if len(pose) != 7:
         raise format_error("timestamp x y z qx qy qz qw id", where, " ".join(fields)[:80])
     quat = pose[[6, 3, 4, 5]]
-    if np.isfinite(pose).all():
-        check_unit_quat(quat, where, EXPORT_AGAIN)
+    if not np.isfinite(pose).all():
+        return stamp, np.full((3, 4), np.nan), node
+    check_unit_quat(quat, where, EXPORT_AGAIN)
     return stamp, np.column_stack([rotation_from_quat(quat), pose[:3]]), node
 
 
