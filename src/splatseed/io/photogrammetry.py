@@ -40,7 +40,7 @@ from splatseed.io.ply import read_ply_float64
 from splatseed.io.point_files import differing_points, first_with_points
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
-from splatseed.text import counted
+from splatseed.text import agreeing, counted
 
 EXPORT_AGAIN = "Export the cameras again."
 _NO_PHOTOGRAPHS = ("mask", "depth", "normal", "segment")
@@ -126,6 +126,14 @@ def _approximated(count: int, error: float) -> list[Finding]:
     text = f"The terms of r^8 of {counted(count, 'camera')}, which COLMAP's models lack, are"
     text += f" approximated by FULL_OPENCV within {error:.2g} px."
     return [Finding("approximated-distortion", text, severity)]
+
+
+def _disabled(names: Sequence[str]) -> list[Finding]:
+    if not names:
+        return []
+    are = agreeing(len(names), "is disabled and", "are disabled and")
+    text = f"{counted(len(names), 'photograph')} {are} left out, such as {names[0]}."
+    return [Finding("disabled-cameras", text, "info", tuple(names))]
 
 
 def ignored(term: str, pixels: float, what: str) -> Finding:
@@ -225,9 +233,9 @@ def make_scene(export: Export, root: Path) -> Scene:
     findings = (
         *export.findings,
         *_approximated(len(errors), max(errors, default=0.0)),
-        *left_out("disabled-cameras", "disabled photograph", "use", export.disabled),
+        *_disabled(export.disabled),
         *left_out("missing-poses", "photograph", "a pose", export.unposed),
-        *left_out("missing-photographs", "image", "a photograph of its own", lost),
+        *left_out("missing-photographs", "photograph", "one file of that name", lost),
         *unusable_findings(unusable, len(images)),
         *_unlisted(folder, [*images], export),
         *photograph_findings([*images.values()], folder, root),
