@@ -45,7 +45,7 @@ def camera_models(rays, kind, c):
     return c["focal_length"] * np.stack([x, y], axis=1) + c["principal_point"]
 
 
-def scene_of(made, root_path="/home/someone/images", posed=5):
+def scene_of(made, root_path="/data/images", posed=5):
     views = [
         {"key": i, "value": {"polymorphic_id": 1073741824, "ptr_wrapper": {"id": i, "data": {
             "local_path": "", "filename": name, "width": SIZE[0], "height": SIZE[1],

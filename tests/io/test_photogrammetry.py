@@ -40,7 +40,7 @@ VALUES = ("nan", "-inf", "1e400", "-1", "0", "null", "[]", '""', "{}", "\ufffd",
         (["a.png"], ["a.jpg"], ["a.png"]),  # undistorted copies
         (["a.v2.jpg"], ["a.v2"], ["a.v2.jpg"]),
         (["x/1.jpg", "y/1.jpg"], ["C:\\data\\x\\1.jpg", "y/1.jpg"], ["x/1.jpg", "y/1.jpg"]),
-        (["x/1.jpg", "y/1.jpg"], ["1.jpg", "/home/me/y/1.jpg"], [None, "y/1.jpg"]),
+        (["x/1.jpg", "y/1.jpg"], ["1.jpg", "/data/y/1.jpg"], [None, "y/1.jpg"]),
         (["y/1.jpg"], ["x/1.jpg", "y/1.jpg"], [None, "y/1.jpg"]),
         (["a.jpg", "a_mask.png"], ["a"], ["a.jpg"]),
         (["a.jpg"], ["a", "a.jpg"], [None, "a.jpg"]),

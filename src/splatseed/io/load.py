@@ -118,7 +118,11 @@ READERS = (
     Reader("Record3D's EXR_RGBD", is_record3d, read_record3d),
     Reader("Stray Scanner's rgb.mp4 with odometry.csv", is_stray, read_stray),
     *(Reader(each.files, each.recognises, each.read_folder) for each in EXPORTS),
-    Reader("frame-000000.pose.txt, or ScanNet's pose with color", is_pose_folder, read_pose_folder),
+    Reader(
+        "ScanNet's pose with color, 7-Scenes' frame-000000.pose.txt",
+        is_pose_folder,
+        read_pose_folder,
+    ),
 )
 """Tried in this order, after COLMAP models and transforms.json."""
 _INCOMPLETE = (
