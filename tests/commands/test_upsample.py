@@ -277,7 +277,7 @@ def own_method(tmp_path, monkeypatch):
     (tmp_path / "package" / f"{value.partition(':')[0]}.py").write_text(code)
     monkeypatch.syspath_prepend(tmp_path / "package")
     monkeypatch.setitem(METHODS._plugins, name, EntryPoint(name, value, GROUP))
-    (command,) = re.findall(r"^splatseed upsample SCENE (.*) -o OUT$", own, re.MULTILINE)
+    *_, command = re.findall(r"^splatseed upsample SCENE (.*) -o OUT$", own, re.MULTILINE)
     return name, command.split()
 
 

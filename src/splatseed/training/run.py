@@ -174,8 +174,11 @@ class TrainingRun:
                     self._board.add_scalar(name, value, record.step)
         if record.test_psnr is None and self._test_views:
             return
-        shown = record.step, record.train_psnr, record.test_psnr, record.num_gaussians
-        LOGGER.debug("step %d: PSNR %.2f dB, of test views %.2f dB, %d Gaussians", *shown)
+        text, shown = "step %d: %d Gaussians, PSNR %.2f dB", [record.step, record.num_gaussians]
+        shown.append(record.train_psnr)
+        if record.test_psnr is not None:
+            text, shown = f"{text}, of test views %.2f dB", [*shown, record.test_psnr]
+        LOGGER.debug(text, *shown)
         write_curve_csv(self.folder.curve_csv, self.state.records)
         if self._saved_step is None or time.monotonic() - self._saved > CHECKPOINT_SECONDS:
             self._save()
