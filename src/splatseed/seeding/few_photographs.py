@@ -82,6 +82,9 @@ def _seeds_of(
     source = np.where(confirmed > 0, source_code("stereo"), source_code("cover"))
     belief = np.where(confirmed > 0, 1.0 - 0.5**confirmed, MAX_CONFIDENCE)
     cloud = PointCloud(
-        xyz.astype(np.float32), colors, source.astype(np.uint8), confidence=belief.astype(np.float32)
+        xyz.astype(np.float32),
+        colors,
+        source.astype(np.uint8),
+        confidence=belief.astype(np.float32),
     )
     return cloud.select(kept)

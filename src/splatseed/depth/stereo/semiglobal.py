@@ -73,17 +73,21 @@ def semiglobal_depths(
     _check_memory(views)
     greys = [grey_image(view.photograph).astype(np.float32) for view in views]
     hypotheses = [_hypotheses(view, xyz) for view in views]
-    maps = [NO_MAP] * len(views)
-    for stage in ("compare photographs", "compare depths"):
-        found = list(maps)
 
-        def work(start: int, stop: int, found: list[Float32[np.ndarray, "H W"]] = found) -> None:
+    def matched(
+        maps: Sequence[Float32[np.ndarray, "H W"]], stage: str
+    ) -> list[Float32[np.ndarray, "H W"]]:
+        found = [NO_MAP] * len(views)
+
+        def work(start: int, stop: int) -> None:
             for i in range(start, stop):
                 found[i] = _depth(i, views, greys, hypotheses[i], maps)
 
         in_threads(work, len(views), 1, stage, progress)
-        maps = found
-    return maps
+        return found
+
+    first = matched([NO_MAP] * len(views), "compare photographs")
+    return matched(first, "compare depths")
 
 
 def _hypotheses(view: View, xyz: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarray, " D"]:

@@ -149,7 +149,7 @@ def combine(costs, places, best_weight, unseen, in_front, out):
             seen, total, best = 0, 0.0, np.inf
             for s in range(count):
                 where = places[s, row, column]
-                if where == OUTSIDE or where == BEHIND:  # noqa: PLR1714  (Numba's is slower)
+                if where in (OUTSIDE, BEHIND):
                     continue
                 cost = costs[s, row, column] + (in_front if where == IN_FRONT else 0.0)
                 seen, total, best = seen + 1, total + cost, min(best, cost)
