@@ -96,8 +96,8 @@ def change_settings(settings: Settings, name: str, values: Mapping[str, Any]) ->
     Raises:
         ParameterError: There is no such field; the message calls fields "parameters of ``name``".
     """
-    has_fields = dataclasses.is_dataclass(settings)
-    known = [field.name for field in dataclasses.fields(settings)] if has_fields else []
+    fields = dataclasses.fields(settings) if dataclasses.is_dataclass(settings) else ()
+    known = [field.name for field in fields]
     for given in values:
         if given not in known:
             raise ParameterError(

@@ -114,5 +114,5 @@ def _find(module: str, paths: list[str]) -> list[Path]:
         spec = spec or find_spec(name)  # of an editable installation
     if spec is None:
         return []
-    folders = spec.submodule_search_locations or ([spec.origin] if spec.has_location else [])
-    return [Path(str(folder)).resolve() for folder in folders]
+    file = [spec.origin] if spec.has_location and spec.origin else []
+    return [Path(folder).resolve() for folder in spec.submodule_search_locations or file]

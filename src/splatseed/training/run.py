@@ -184,8 +184,8 @@ class TrainingRun:
                     self._board.add_scalar(name, value, record.step)
         if record.test_psnr is None and self._test_views:
             return
-        text, shown = "step %d: %d Gaussians, PSNR %.2f dB", [record.step, record.num_gaussians]
-        shown.append(record.train_psnr)
+        text = "step %d: %d Gaussians, PSNR %.2f dB"
+        shown = [record.step, record.num_gaussians, record.train_psnr]
         if record.test_psnr is not None:
             text, shown = f"{text}, of test views %.2f dB", [*shown, record.test_psnr]
         LOGGER.debug(text, *shown)

@@ -6,7 +6,7 @@ import dataclasses
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -57,7 +57,9 @@ INTERPOLATING = ("linear", "triangle", "spline", "mls", "voronoi", "random")
 
 def parameters_of(method: Upsampler) -> dict[str, object]:
     """Return a method's parameters by name, without those of a cloud that other lines show."""
-    given = dataclasses.asdict(method) if dataclasses.is_dataclass(method) else {}  # type: ignore[arg-type]  # an instance
+    given: dict[str, Any] = {}
+    if dataclasses.is_dataclass(method) and not isinstance(method, type):
+        given = dataclasses.asdict(method)
     return {name: value for name, value in given.items() if name not in CLOUD_PARAMETERS}
 
 
