@@ -44,7 +44,9 @@ def test_a_view_beyond_the_frames_is_no_longer_black(room):
     cap = len(model) + added // 2
     capped = with_margins(model, frame, views, cap)
     assert len(capped) <= cap
-    assert len(capped) - len(np.intersect1d(capped.means[:, 0], model.means[:, 0])) <= SHARE * cap + 1
+    assert (
+        len(capped) - len(np.intersect1d(capped.means[:, 0], model.means[:, 0])) <= SHARE * cap + 1
+    )
 
     def black(gaussians, view):
         return (ModelRenderer(gaussians, frame).color(view).sum(axis=2) < 0.02).mean()
