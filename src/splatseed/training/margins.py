@@ -86,13 +86,11 @@ def with_margins(
         "sh0": ((colors - 0.5) / SH_C0)[:, None],
         "shN": np.zeros((len(xyz), *model.shN.shape[1:])),
     }
-    return replace(
-        model,
-        **{
-            name: np.concatenate([array, added[name].astype(np.float32)])
-            for name, array in model.arrays().items()
-        },
-    )
+    grown = {
+        name: np.concatenate([array, added[name].astype(np.float32)])
+        for name, array in model.arrays().items()
+    }
+    return Gaussians(**grown, antialiased=model.antialiased)
 
 
 def _reduced(view: View) -> View:
