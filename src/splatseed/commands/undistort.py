@@ -31,6 +31,8 @@ class Options:
     """A scene with photographs, in any layout."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The scene folder to write, in COLMAP's layout."""
+    mask_below: float = 0.0
+    """Mask panoramas within this angle of straight down, in degrees, where the photographer is."""
     overwrite: bool = False
     """Replace an output folder that splatseed undistort wrote before."""
 
@@ -43,13 +45,16 @@ def run(arguments: list[str]) -> None:
     check_output(output, kind="undistort", overwrite=overwrite, protect=[options.scene])
     with stage_display(lines=True) as clock:
         clock("read", 0.0)
-        scene = load_scene(options.scene, require_points=False)
-        clock.count(len(scene.images), "photographs", "undistortion")
-        report = undistort(scene, output, overwrite=overwrite, on_progress=clock)
+        scene = load_scene(options.scene, require_points=False, panoramas=True)
+        whole = sum(image.intrinsics.is_panorama for image in scene.images)
+        clock.count(len(scene.images) + 5 * whole, "photographs", "undistortion")
+        report = undistort(
+            scene, output, mask_below=options.mask_below, overwrite=overwrite, on_progress=clock
+        )
     counts = [("images", f"{report.registered:,}"), ("points", f"{report.num_points:,}")]
     print_pairs("splatseed undistort", [*counts, ("output", str(output))])
     add_results(output=output, images=report.registered, points=report.num_points)
-    print_note(*without_kinds(scene.findings, "lens-distortion"))
+    print_note(*report.findings, *without_kinds(scene.findings, "lens-distortion"))
     maps = scene.depths or depths_beside(scene)
     if isinstance(maps, DepthFiles) and maps:
         folder = quoted(os.path.commonpath([path.parent for path in maps.paths.values()]))
