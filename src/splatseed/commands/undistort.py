@@ -17,6 +17,7 @@ from splatseed.io.depth_maps import DepthFiles
 from splatseed.io.load import depths_beside
 from splatseed.io.seeds import was_upsampled
 from splatseed.io.staging import check_output
+from splatseed.photos.panorama import FACES
 from splatseed.requirements import require
 from splatseed.seeding.advice import is_distorted
 from splatseed.sfm import undistort
@@ -47,7 +48,7 @@ def run(arguments: list[str]) -> None:
         clock("read", 0.0)
         scene = load_scene(options.scene, require_points=False, panoramas=True)
         whole = sum(image.intrinsics.is_panorama for image in scene.images)
-        clock.count(len(scene.images) + 5 * whole, "photographs", "undistortion")
+        clock.count(len(scene.images) + (len(FACES) - 1) * whole, "photographs", "undistortion")
         report = undistort(
             scene, output, mask_below=options.mask_below, overwrite=overwrite, on_progress=clock
         )

@@ -233,9 +233,7 @@ def cut_finding(what: str, lenses: Mapping[str, Intrinsics], fix: str = "") -> F
     sides = sorted({face_lens(lens).width for lens in lenses.values()})
     size = " or ".join(f"{side} x {side}" for side in sides)
     each = agreeing(len(lenses), "is", "are each")
-    text = (
-        f"{what} {each} cut into {len(FACES)} photographs of {size} px, all of which test or none."
-    )
+    text = f"{what} {each} cut into {len(FACES)} photographs of {size} px."
     return Finding("panoramas", text, "info", tuple(lenses), fix)
 
 
