@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -204,13 +205,40 @@ def test_panoramas_are_recognised(walk, tmp_path, rng):
     assert find_panoramas(tmp_path, photos, "none") == ({}, ())
     with pytest.raises(ParameterError, match=r"square\.jpg of 192 x 192"):
         find_panoramas(tmp_path, photos, "all")
-    for name in ("studio.jpg", "square.jpg"):  # the second shows some directions only
-        with (tmp_path / name).open("ab") as file:
-            file.write(GPANO % b"equirectangular")
-    with (tmp_path / "crop.jpg").open("ab") as file:
-        file.write(GPANO % b"cylindrical")
+    whole, other = GPANO % b"equirectangular", GPANO % b"cylindrical"
+    half = whole + b"<GPano:CroppedAreaImageWidthPixels>192</GPano:CroppedAreaImageWidthPixels>"
+    half += b'<x GPano:FullPanoWidthPixels="384"/>'
+    for name, tag in {"studio": whole, "square": whole, "crop": other, "panorama": half}.items():
+        with (tmp_path / name / f"{name}.jpg").open("ab") as file:
+            file.write(tag)
     found, (_, part) = find_panoramas(tmp_path, photos)
-    others = ["studio/2_studio.jpg", "studio/studio.jpg"]  # the same files
-    assert [*found] == ["studio.jpg", *others]  # of the others most do not close
+    studio = ["studio.jpg", "studio/2_studio.jpg", "studio/studio.jpg"]
+    assert sorted(found) == studio  # the others show some directions, or do not close
     assert part.severity == "warning"
-    assert part.subjects == ("square.jpg", "square/2_square.jpg", "square/square.jpg")
+    assert {name.rpartition("/")[2].removeprefix("2_") for name in part.subjects} == {
+        "square.jpg", "crop.jpg", "panorama.jpg",
+    }  # fmt: skip
+
+
+def test_photographs_are_never_overwritten(walk, tmp_path):
+    """A folder with panoramas and what was cut from them: links to photographs are not followed."""
+    for name in ("p0.jpg", "p1.jpg"):
+        (tmp_path / name).write_bytes((walk / name).read_bytes())
+    Image.new("RGB", (146, 146)).save(tmp_path / "up_p1.jpg")
+    before = (tmp_path / "up_p1.jpg").read_bytes()
+    with pytest.raises(ParameterError, match=r"found up_p1\.jpg"):
+        reconstruct(tmp_path, tmp_path.parent / "never", panoramas="auto")
+    assert (tmp_path / "up_p1.jpg").read_bytes() == before
+
+
+def test_tracks_of_features_that_are_missing_lose_them(scene, tmp_path):
+    """As files with one side of a reference only, or with a photograph that is missing."""
+    whole = load_scene(scene, panoramas=True)
+    tracks = whole.tracks
+    index, ids = tracks.point2d_idx.copy(), tracks.image_ids.copy()
+    index[0], ids[5] = 4000, 99
+    broken = whole.replace(tracks=replace(tracks, point2d_idx=index, image_ids=ids))
+    undistort(broken, tmp_path / "cut")
+    cut = load_scene(tmp_path / "cut")
+    assert cut.tracks.lengths.tolist() == [NUM - 1, NUM - 1, *[NUM] * 38]
+    assert cut.tracks.errors.max() < 1e-6

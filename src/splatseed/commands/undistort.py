@@ -60,8 +60,11 @@ def run(arguments: list[str]) -> None:
     if isinstance(maps, DepthFiles) and maps:
         folder = quoted(os.path.commonpath([path.parent for path in maps.paths.values()]))
         are = agreeing(len(maps), "is", "are")
-        text = f"Its {counted(len(maps), 'depth map')} {are} not in the output: name them to "
-        print_note(Finding("depth-maps-left-out", f"{text}upsample by --depth {folder}."))
+        text = f"Its {counted(len(maps), 'depth map')} {are} not in the output"
+        how = (
+            ", as panoramas have none" if whole else f": name them to upsample by --depth {folder}"
+        )
+        print_note(Finding("depth-maps-left-out", f"{text}{how}."))
     if not is_distorted(scene):
         text = "No camera had distortion: the photographs are copies."
         print_note(Finding("no-distortion", text, "info"))

@@ -17,6 +17,7 @@ from typing import Any, Literal, TypeAlias, TypeVar, get_args
 import numpy as np
 
 from splatseed import errors
+from splatseed.camera import Intrinsics
 from splatseed.photos.panorama import FACES
 from splatseed.progress import Progress
 from splatseed.requirements import install_command
@@ -176,21 +177,25 @@ def guessed_model(run: ColmapRun, cameras: Sequence[SharedCamera], camera_model:
     return model
 
 
+def _known_camera(pycolmap: Any, camera_id: int, lens: Intrinsics) -> Any:
+    return pycolmap.Camera(
+        camera_id=camera_id,
+        model=lens.model,
+        width=lens.width,
+        height=lens.height,
+        params=list(lens.params),
+        has_prior_focal_length=True,  # for the verification of matches
+    )
+
+
 def _add_rig(pycolmap: Any, model: Any, rig: PanoramaRig, images: dict[str, Any]) -> None:
     """Add the cameras and frames of panoramas of one size to a model, and their images.
 
     The images are taken out of ``images``. A frame has the id of its first image.
     """
-    record, lens = pycolmap.Rig(rig_id=rig.first_id), rig.lens
+    record = pycolmap.Rig(rig_id=rig.first_id)
     for camera_id, turn in enumerate(FACES.values(), rig.first_id):
-        camera = pycolmap.Camera(
-            camera_id=camera_id,
-            model=lens.model,
-            width=lens.width,
-            height=lens.height,
-            params=list(lens.params),
-            has_prior_focal_length=True,
-        )
+        camera = _known_camera(pycolmap, camera_id, rig.lens)
         model.add_camera(camera)
         if camera_id == rig.first_id:  # the face in front, in the panorama's axes
             record.add_ref_sensor(camera.sensor_id)
@@ -219,15 +224,7 @@ def posed_model(pycolmap: Any, poses: Sequence[Image], without: Collection[str] 
         lens = posed.intrinsics
         camera_id = ids.setdefault(lens.camera_id, len(ids) + 1)
         if not model.exists_camera(camera_id):
-            camera = pycolmap.Camera(
-                camera_id=camera_id,
-                model=lens.model,
-                width=lens.width,
-                height=lens.height,
-                params=list(lens.params),
-                has_prior_focal_length=True,  # for the verification of matches
-            )
-            model.add_camera_with_trivial_rig(camera)
+            model.add_camera_with_trivial_rig(_known_camera(pycolmap, camera_id, lens))
         if posed.name in without:
             continue
         image = pycolmap.Image(name=posed.name, image_id=number, camera_id=camera_id)

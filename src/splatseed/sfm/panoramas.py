@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -53,9 +53,9 @@ show a margin of one another."""
 _JPEG_QUALITY = 95
 _MAX_MASKED = 80.0  # degrees from straight down
 _HEAD_BYTES = 1 << 18  # of a file, in which its XMP is
-_EQUIRECTANGULAR = re.compile(
-    rb"GPano:ProjectionType\s*(=\s*[\"']|>)\s*equirectangular", re.IGNORECASE
-)
+_GPANO = re.compile(rb"GPano:(\w+)\s*(?:=\s*[\"']|>)\s*(\w+)")
+_SIZES = (("CroppedAreaImageWidthPixels", "FullPanoWidthPixels"),
+          ("CroppedAreaImageHeightPixels", "FullPanoHeightPixels"))  # fmt: skip
 _CHECKED_WIDTH = 1024
 _NEAR, _MAX_STEP = 6, 1.5
 """Columns beside each side, and how many times the difference of two of them the sides' may be."""
@@ -98,7 +98,7 @@ def face_names(name: str) -> list[str]:
 def cut_photographs(
     image_dir: Path,
     panoramas: Mapping[str, Intrinsics],
-    others: Iterable[str],
+    others: Collection[str],
     folder: Path,
     *,
     masks: Masks | None = None,
@@ -120,6 +120,12 @@ def cut_photographs(
     """
     images = folder / "images"
     images.mkdir(parents=True)
+    if taken := {*others} & {face for name in panoramas for face in face_names(name)}:
+        raise ParameterError(
+            "no other photographs with the names of the panoramas' parts",
+            found=name_some(sorted(taken), 3),
+            fix="Leave out either the panoramas or what was cut from them.",
+        )
     link_folders({name: image_dir / name for name in others}, images, copy=False)
     files = {} if masks is None else {n: p for n, p in masks.files.items() if n not in panoramas}
     inverted = masks is not None and masks.inverted
@@ -197,9 +203,10 @@ def find_panoramas(
     Raises:
         ParameterError: All are to be panoramas, and one is not twice as wide as high.
     """
+    if choice == "none":
+        return {}, ()
     wide = [name for name, photo in photos.items() if photo.size[0] == 2 * photo.size[1]]
     odd = sorted(photos.keys() - {*wide})
-    stated = {name for name in photos if _states_panorama(image_dir / name)}
     if choice == "all" and odd:
         width, height = photos[odd[0]].size
         raise ParameterError(
@@ -208,21 +215,31 @@ def find_panoramas(
             fix="Remove the photographs that are none, or leave `panoramas` out.",
         )
     findings: list[Finding] = []
+    stated = dict.fromkeys(wide, True)
     if choice == "auto":
-        for size in {photos[name].size for name in wide} if {*wide} - stated else ():
+        given = {name: _stated(image_dir / name) for name in photos}
+        stated = {name: is_whole for name, is_whole in given.items() if is_whole is not None}
+        open_sides = {name for name in wide if stated.get(name) is False}
+        for size in {photos[name].size for name in wide if name not in stated}:
             alike = [name for name in wide if photos[name].size == size and name not in stated]
-            if not _close([image_dir / name for name in alike]):
-                wide = [name for name in wide if name not in alike]
-        if parts := sorted(stated & {*odd}):
+            # No photograph of another kind closes, but an object at a panorama's side may hide it.
+            if 2 * sum(_closes(image_dir / name) for name in alike) <= len(alike):
+                open_sides |= {*alike}
+        wide = [name for name in wide if name not in open_sides]
+        if parts := sorted(name for name in stated if name not in wide):
             text = f"{counted(len(parts), 'panorama')} of some directions ({name_some(parts, 3)})"
             how = f"{text} {agreeing(len(parts), 'is', 'are')} used as perspective photographs."
             findings = [Finding("panoramas", how, subjects=tuple(parts), fix="Remove them.")]
-    if choice == "none" or not wide:
+    if not wide:
         return {}, tuple(findings)
     lenses = {
         n: Intrinsics(1, PANORAMA.name, *(s := photos[n].size), tuple(map(float, s))) for n in wide
     }
-    why = "by their XMP" if stated >= {*wide} else "twice as wide as high, and closed at the sides"
+    why = (
+        "by their XMP"
+        if stated.keys() >= {*wide}
+        else "twice as wide as high, and closed at the sides"
+    )
     text = f"{counted(len(wide), 'panorama')} ({why if choice == 'auto' else 'as chosen'})"
     fix = "`panoramas='none'` takes them for perspective photographs." if choice == "auto" else ""
     return lenses, (cut_finding(text, lenses, fix), *findings)
@@ -237,14 +254,16 @@ def cut_finding(what: str, lenses: Mapping[str, Intrinsics], fix: str = "") -> F
     return Finding("panoramas", text, "info", tuple(lenses), fix)
 
 
-def _states_panorama(path: Path) -> bool:
+def _stated(path: Path) -> bool | None:
+    """Whether a photograph's XMP states a panorama of all directions; None without any panorama."""
     with open_file(path) as file:
-        return _EQUIRECTANGULAR.search(file.read(_HEAD_BYTES)) is not None
-
-
-def _close(paths: Sequence[Path]) -> bool:
-    """Whether the sides of most of these photographs of one size join, as no others' do."""
-    return 2 * sum(map(_closes, paths)) > len(paths)
+        tags = {
+            key.decode(): value.decode() for key, value in _GPANO.findall(file.read(_HEAD_BYTES))
+        }
+    if "ProjectionType" not in tags:
+        return None
+    whole = all(tags.get(cropped) == tags.get(full) for cropped, full in _SIZES)
+    return whole and tags["ProjectionType"].lower() == "equirectangular"
 
 
 def _closes(path: Path) -> bool:
@@ -346,14 +365,19 @@ def cut_scene(scene: Scene, folder: Path, mask_below: float, progress: Progress)
 
 
 def _moved(tracks: Tracks, moved: Sequence[tuple[int, np.ndarray, np.ndarray]]) -> Tracks:
-    """Return tracks with other images and features: for each image its old id, and the new ids."""
-    starts = np.cumsum([0, *(len(ids) for _, ids, _ in moved)])
-    first = dict(zip((image_id for image_id, _, _ in moved), starts, strict=False))
-    at = np.array([first[i] for i in tracks.image_ids.tolist()], np.int64) + tracks.point2d_idx
-    ids, index = (np.concatenate([each[part] for each in moved]) for part in (1, 2))
-    return replace(
-        tracks, image_ids=ids[at].astype(np.uint32), point2d_idx=index[at].astype(np.uint32)
-    )
+    """Return tracks with other images and features.
+
+    ``moved`` has for each image its old id, and the new image and index of each feature. What is
+    not there gets image 0, which no scene has: ``write_scene`` drops it.
+    """
+    ids, index = np.zeros(len(tracks.image_ids), np.uint32), tracks.point2d_idx.copy()
+    order = np.argsort(tracks.image_ids, kind="stable")
+    for image_id, new_ids, new_index in moved:
+        first, last = np.searchsorted(tracks.image_ids, [image_id, image_id + 1], sorter=order)
+        rows = order[first:last]
+        rows = rows[index[rows] < len(new_ids)]
+        ids[rows], index[rows] = new_ids[index[rows]], new_index[index[rows]]
+    return replace(tracks, image_ids=ids, point2d_idx=index)
 
 
 def split_of_faces(names: Mapping[str, Sequence[str]], listed: Split | None = None) -> Split | None:
@@ -366,7 +390,7 @@ def split_of_faces(names: Mapping[str, Sequence[str]], listed: Split | None = No
         return None
     test = set(sorted(names)[::TEST_EVERY]) if listed is None else listed.test
     train = names.keys() - test if listed is None else listed.train
-    parts = [
+    trained, tested = (
         frozenset(face for name in part for face in names.get(name, ())) for part in (train, test)
-    ]
-    return Split(*parts, "list by panorama")
+    )
+    return Split(trained, tested, "list by panorama")
