@@ -57,8 +57,10 @@ _GPANO = re.compile(rb"GPano:(\w+)\s*(?:=\s*[\"']|>)\s*(\w+)")
 _SIZES = (("CroppedAreaImageWidthPixels", "FullPanoWidthPixels"),
           ("CroppedAreaImageHeightPixels", "FullPanoHeightPixels"))  # fmt: skip
 _CHECKED_WIDTH = 1024
-_NEAR, _MAX_STEP = 6, 1.5
-"""Columns beside each side, and how many times the difference of two of them the sides' may be."""
+_NEAR, _MAX_STEP = 6, 2.0
+"""Columns beside each side, and how many times the difference of two of them the sides' may be: at
+most 0.9 in panoramas as cameras save them, 1.8 in resampled ones; 3 and more in crops of other
+photographs."""
 _ALIKE, _MAX_UNIFORM = 8.0, 0.8  # distance from the side's median, and the share of such pixels
 PanoramasName: TypeAlias = Literal["auto", "all", "none"]
 
