@@ -73,4 +73,5 @@ def test_few_whole_photographs_alone_have_margins(room):
     assert has_margins(settings, views[:3])
     assert not has_margins(dataclasses.replace(settings, start="model.ply"), views[:3])
     assert not has_margins(dataclasses.replace(settings, strategy="default-3dgs"), views[:3])
+    assert not has_margins(dataclasses.replace(settings, strategy="none"), views[:3])
     assert not has_margins(settings, [*views] * 2)

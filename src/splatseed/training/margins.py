@@ -40,11 +40,12 @@ OPACITY = 0.9
 def has_margins(settings: TrainSettings, views: Sequence[View]) -> bool:
     """Whether the model of a run gets margins: with few photographs that show all there is.
 
-    Not of 3DGS as published, of a run that continues one, or of objects cut out.
+    Not where the number of Gaussians stays, of 3DGS as published, of a run that continues one, or
+    of objects cut out.
     """
     cut_out = any(view.empty is not None or view.opacity is not None for view in views)
-    few = len(views) <= MAX_PHOTOGRAPHS
-    return few and not settings.as_3dgs and settings.start is None and not cut_out
+    grows = settings.traits.number_grows and not settings.as_3dgs and settings.start is None
+    return grows and not cut_out and len(views) <= MAX_PHOTOGRAPHS
 
 
 def with_room(settings: TrainSettings) -> TrainSettings:
