@@ -44,7 +44,7 @@ if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for i
     from splatseed.training.model_views import ModelViews
 
 PAGE = ".html"
-PAGE_DESCRIPTION = "html: one colour per Gaussian, their mean over the training cameras; browsers"
+PAGE_DESCRIPTION = "html: SuperSplat's viewer with the model as .sog; browsers"
 OWN = "own"
 """The value of --clean for the scene of the run."""
 LOSSLESS = "ply"
@@ -119,7 +119,7 @@ def run(arguments: list[str]) -> None:
         if len(kept) < len(cropped):
             stages["kept"] = kept
         if job.is_page:
-            _write_page(job, kept, clock, findings.append)
+            stages["page"] = _write_page(job, kept, views, clock, findings.append)
         else:
             placed = _write_file(job, kept, clock, findings.append)
             if job.format != LOSSLESS:
@@ -169,12 +169,18 @@ def _checked(options: Options) -> _Job:
         (page and transform is not None, "--transform for a file of Gaussians", "a web page",
          "A page shows the model in its scene's frame: leave it out."),
     )  # fmt: skip
-    if cleans or page:
-        require("torch", *["viser"] * page)
+    if cleans:
+        require("torch")
     budget = None if options.budget is None else parse_budget(options.budget, 0)
     if not named and scene is not None and not scene.exists():
         scene = None  # the run was made elsewhere
     return _Job(options, path, name, config, scene, crop, transform, budget)
+
+
+def _split(job: _Job) -> dict[str, int]:
+    """Return the options of the run that choose the views and their size, as far as known."""
+    options = {name: job.config.get(name) for name in ("data_factor", "test_every")}
+    return {name: value for name, value in options.items() if isinstance(value, int)}
 
 
 def _views(job: _Job, gaussians: Gaussians, progress: Progress, note: Note) -> ModelViews | None:
@@ -182,13 +188,14 @@ def _views(job: _Job, gaussians: Gaussians, progress: Progress, note: Note) -> M
 
     Those of a scene that the user names are an error if they cannot be used.
     """
-    needed = job.budget is not None or not (job.is_page or job.format == LOSSLESS)
+    needed = job.budget is not None or job.format != LOSSLESS
     if job.scene is None or not needed:
         return None
     named = job.options.scene is not None
-    if not named and not all(map(version_of, ("torch", "gsplat"))):
+    if not named and not job.is_page and not all(map(version_of, ("torch", "gsplat"))):
         return None
-    require("torch", "gsplat")
+    if named or not job.is_page:
+        require("torch", "gsplat")
     from splatseed.training.model_views import find_model_views
 
     try:
@@ -211,14 +218,9 @@ def _kept(
     if options.clean is not None:
         from splatseed.training.floaters import floaters_of_model
 
-        numbers = {
-            name: value
-            for name in ("data_factor", "test_every")
-            if isinstance(value := job.config.get(name), int)
-        }
         masks = job.config.get("masks")
         bad = floaters_of_model(
-            job.path, Path(str(job.scene)), masks=masks, progress=progress, **numbers
+            job.path, Path(str(job.scene)), masks=masks, progress=progress, **_split(job)
         )
         rows.append(("floaters", f"{np.count_nonzero(bad):,} left out"))
         keep &= ~bad
@@ -281,16 +283,23 @@ def _write_file(job: _Job, kept: Gaussians, progress: Progress, note: Note) -> S
     return moved
 
 
-def _write_page(job: _Job, kept: Gaussians, progress: Progress, note: Note) -> None:
-    """Write the Gaussians as a web page, named after the run or the file."""
-    from splatseed.viewer.models import item_of_model
-    from splatseed.viewer.web_page import check_page_size, write_page
+def _write_page(
+    job: _Job, kept: Gaussians, views: ModelViews | None, progress: Progress, note: Note
+) -> Gaussians:
+    """Write the Gaussians as a web page, named after the run or the file; return what it shows."""
+    from splatseed.viewer.models import ViewerItem
+    from splatseed.viewer.web_page import write_page
 
-    model = job.options.model
-    check_page_size(len(kept))
+    model, world = job.options.model, None if views is None else views.file_from_scene
     name = model.resolve().name if model.is_dir() else model.stem
-    item = item_of_model(name, job.path, kept, note)
-    write_page(job.options.output, item, progress, note)
+    placed = kept if world is None else transform_gaussians(kept, world.inverse)
+    if views is None:
+        item = ViewerItem(name, None, placed, background=background_of(job.path) or BLACK)
+    else:
+        scene = views.scene
+        item = ViewerItem(name, scene, placed, **_split(job), background=scene.background)
+    shown = write_page(job.options.output, item, progress, note)
+    return shown if world is None else transform_gaussians(shown, world)
 
 
 def _loss(
@@ -314,7 +323,7 @@ def _loss(
         frame = frame_of_model(around, NO_POINTS, models[0])
         return measure_loss(models, around, frame, device, progress)
     test = [replace(view, photograph=NO_PIXELS) if cropped else view for view in views.test]
-    return measure_loss(models, test, views.frame, device, progress, views.background)
+    return measure_loss(models, test, views.frame, device, progress, views.scene.background)
 
 
 def _loss_rows(
@@ -339,7 +348,8 @@ def _loss_rows(
 def _loss_findings(
     loss: RenderLoss | None, stages: Mapping[str, Gaussians], job: _Job
 ) -> list[Finding]:
-    found = loss.finding(job.options.output.suffix) if loss and "file" in stages else None
+    packed = {"file", "page"} & stages.keys()
+    found = loss.finding(job.options.output.suffix) if loss and packed else None
     return [found] if found else []
 
 

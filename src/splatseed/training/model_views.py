@@ -25,7 +25,7 @@ from splatseed.photos.sizes import default_factor
 from splatseed.photos.view import View, camera_views
 from splatseed.progress import Progress, silent
 from splatseed.sampling import evenly_spaced
-from splatseed.scene import BLACK, Color, Image, Scene
+from splatseed.scene import BLACK, Image, Scene
 from splatseed.similarity import Similarity
 from splatseed.splat.background import background_of
 from splatseed.splat.gaussians import Gaussians
@@ -48,8 +48,10 @@ class ModelViews(NamedTuple):
     """Some of the test views; with their photographs, if the scene has them."""
     frame: TrainingFrame
     """To render in."""
-    background: Color = BLACK
-    """Behind renders, and behind transparent pixels of the photographs."""
+    scene: Scene
+    """Its background is behind renders, and behind transparent pixels of the photographs."""
+    file_from_scene: Similarity | None
+    """From the scene's frame to the file's; None if they are the same."""
 
 
 def find_model_views(
@@ -110,7 +112,8 @@ def find_model_views(
         views,
         views_of(compared, pixels=True),
         frame_of_model(views, points if world is None else world.points(points), gaussians),
-        scene.background,
+        scene,
+        world,
     )
 
 
