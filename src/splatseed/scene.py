@@ -309,11 +309,11 @@ class Split:
     test: frozenset[str]  # names of the images to test; an image may be in neither
     origin: str  # the list, in words
 
-    @property
-    def sentence(self) -> str:
-        """A note on the split, for messages."""
+    def finding(self, *, given: bool) -> Finding:
+        """Return a note on the split; ``given``: the user passed ``test_every``."""
         count = f"{len(self.train):,} training and {len(self.test):,} test images"
-        return f"The split is that of the scene's {self.origin}: {count}; `test_every` is ignored."
+        text = f"The split is that of the scene's {self.origin}: {count}"
+        return Finding("listed-split", text + ("; `test_every` is ignored." * given or "."), "info")
 
 
 @dataclass(frozen=True)

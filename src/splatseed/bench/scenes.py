@@ -15,7 +15,6 @@ import numpy as np
 
 from splatseed.depthmap import DepthMaps
 from splatseed.errors import SceneNotFoundError
-from splatseed.findings import Finding
 from splatseed.io import load_originals
 from splatseed.io.clouds import open_cloud
 from splatseed.io.colmap_model import scene_root
@@ -162,7 +161,7 @@ def survey(
     depth = Path(planned.depth or scene.source.root or path)
     if with_depth and (planned.depth or search_depths(scene, depth) is not None):
         maps, scene = str(depth.resolve()), with_depths_in(scene, depth)
-    split = [Finding("listed-split", scene.listed.sentence, "info")] if scene.listed else []
+    split = [scene.listed.finding(given=False)] if scene.listed else []
     for finding in (*scene.findings, *split, *stray_cameras(scene)):
         note(finding)
     return SceneFacts(

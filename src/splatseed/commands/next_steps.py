@@ -34,8 +34,8 @@ TrainerName: TypeAlias = Literal[
 RATIO = 16
 SMALL_SIDE, SMALL_STEPS = 480, 1500
 """A run of minutes on a CPU: 146 photographs take 132 seconds on one core (README)."""
-COMPARE_SECONDS = 0.5
-"""CPU seconds in which stereo compares a photograph (benchmarks/README.md, real size)."""
+SEED_SECONDS, REFINE_SECONDS = 0.5, 1.5
+"""CPU seconds per photograph for seeds and refined poses (benchmarks/README.md, real size)."""
 COLMAP_ONLY = frozenset({"gsplat", "graphdeco", "LichtFeld"})
 """Trainers that read COLMAP's layout better than transforms.json."""
 COMMON_LENSES = frozenset({"SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"})
@@ -61,7 +61,7 @@ class Planned(NamedTuple):
     max_seeds: int
     flags: str
     trainer: TrainerName
-    seconds: float  # roughly, of splatseed's own training on this machine's CPU
+    seconds: float  # roughly, of all steps of splatseed's own training on this machine's CPU
     most_seeds: int  # that auto makes without a budget
 
     @classmethod
@@ -98,9 +98,7 @@ class Planned(NamedTuple):
             width, height = sorted(sizes, key=math.prod)[len(sizes) // 2]
             rho = f"{number / pixels:.2g}rho of {width} x {height} pixels"
         seeds = min(len(scene.points), max_seeds) or max_seeds
-        threads = available_cpus()
-        seconds = planned_seconds(settings, seeds, pixels, threads)
-        seconds += COMPARE_SECONDS * len(images) / threads
+        seconds = planned_seconds(settings, seeds, pixels, available_cpus())
         most = len(scene.points) + _most_seeds(images)
         traits = settings.traits
         return cls(number, rho, max_steps, traits, max_seeds, flags, trainer, seconds, most)
@@ -142,11 +140,14 @@ def advice_commands(
     train, label = f"splatseed train {source} {how}-o RUN", "train"
     shorter: Commands = []
     if not (which("nvidia-smi") or which("rocminfo")):
-        label = f"train, about {format_duration(planned.seconds)}"
+        seeds = advice.method == "auto"
+        first_seconds = _seconds_before(scene, seeds=seeds, refine=refine and seeds)
+        label = f"train, about {format_duration(planned.seconds + first_seconds)}"
         small = Planned.of(scene, None, SMALL_STEPS, long_side=SMALL_SIDE)
         how = f"{refining}--long-side {SMALL_SIDE} --max-steps {SMALL_STEPS} -o SMALL"
         command = f"splatseed train {source} {how}"
-        shorter = [(f"or about {format_duration(small.seconds)}", command)]
+        first_seconds = _seconds_before(scene, seeds=seeds, refine=refine)
+        shorter = [(f"or about {format_duration(small.seconds + first_seconds)}", command)]
     commands = [*first, (label, train), *shorter]
     if advice.method == "auto":
         others = _seeding(path, advice, planned, refine=refine)
@@ -163,6 +164,12 @@ def _seeding(path: Path, advice: Advice, planned: Planned, *, refine: bool) -> s
         how = "--method linear --ratio 1"
     options = [how, "--refine-poses" if refine else "", "-o OUT"]
     return " ".join([f"splatseed upsample {quoted(path)}", *filter(None, options)])
+
+
+def _seconds_before(scene: Scene, *, seeds: bool, refine: bool) -> float:
+    """Estimate the seconds that ``train`` takes on this machine's CPU before its first step."""
+    each = SEED_SECONDS * seeds + REFINE_SECONDS * refine
+    return each * len(scene.images) / available_cpus()
 
 
 def _most_seeds(images: Sequence[Image]) -> int:

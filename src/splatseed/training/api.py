@@ -177,7 +177,7 @@ def prepare_training(
     for finding in scene.findings:
         note(finding)
     if scene.listed is not None:
-        note(Finding("listed-split", scene.listed.sentence, "info"))
+        note(scene.listed.finding(given="test_every" in request.named))
     settings = _sized(settings, scene, request.long_side, resumed, note)
     settings = _within_budget(settings, request.budget, scene, note)
     if settings.seeding == "auto" and (why := no_seeding_reason(scene, settings)):

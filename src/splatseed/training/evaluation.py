@@ -117,7 +117,7 @@ class Evaluation:
         """Return what may make the scores wrong, or different from those that the user expects."""
         found, listed = [*loaded.findings], loaded.scene.listed
         if listed is not None:
-            found.append(Finding("listed-split", listed.sentence, "info"))
+            found.append(listed.finding(given=self.request.test_every is not None))
         if self.config:
             found += self._changes(loaded.scene, [view.name for view in loaded.views])
         elif isinstance(self.model, Path):

@@ -1,7 +1,8 @@
 """A model as one web page: PlayCanvas's SuperSplat viewer, with the model inside as an ``.sog``.
 
 Promise: the page needs no network and no server; a browser opens it from disk. It draws what the
-``.sog`` keeps: sizes, opacities and colours that depend on the view. The folder ``supersplat`` has
+``.sog`` keeps: sizes, opacities and colours that depend on the view, as sharp as training saw them
+(``_as_trained``). The folder ``supersplat`` has
 the stylesheet and the bundle of @playcanvas/supersplat-viewer 1.36.2 as published, compressed by
 ``gzip -9n``, and its licence. Source of its options and settings: its API reference.
 
@@ -17,6 +18,8 @@ import json
 import math
 import tempfile
 from base64 import b64encode
+from collections.abc import Sequence
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from string import Template
@@ -28,8 +31,11 @@ from splatseed.camera import Camera
 from splatseed.errors import OutputError
 from splatseed.io.staging import atomic_file
 from splatseed.photos.upright import vertical
+from splatseed.photos.view import View
 from splatseed.photos.viewpoint import choose_image
+from splatseed.photos.visibility import points_in_image
 from splatseed.progress import Note, Progress, silent, silent_note
+from splatseed.sampling import evenly_spaced
 from splatseed.similarity import Similarity
 from splatseed.splat.formats import read_gaussians, write_gaussians
 from splatseed.splat.gaussians import Gaussians
@@ -45,6 +51,13 @@ ASPECT = 1.5
 """Of the window that shows the whole first image."""
 MAX_FOV = 120.0
 """Of the viewer's cameras, degrees."""
+BLUR = 0.3
+"""Variance that rendering adds to each Gaussian, pixels squared."""
+KERNEL = 1.076
+"""Area under a Gaussian, cut off where alpha is 1/255, over that under the viewer's kernel, which
+subtracts exp(-4) so as to vanish at sqrt(8) sigma; of an opaque Gaussian."""
+BLUR_VIEWS = 24
+"""Training cameras, evenly chosen, whose pixels give the blur of training."""
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 _PAGE = Template("""<!doctype html>
 <html lang="en">
@@ -57,12 +70,14 @@ _PAGE = Template("""<!doctype html>
 html, body { height: 100%; margin: 0; overflow: hidden; background: rgb($background); }</style>
 </head>
 <body>
-<script type="text/plain" id="viewer">$viewer</script>
+<script type="text/plain" id="code">$viewer</script>
 <script type="text/plain" id="model">$model</script>
 <script type="module">
 const bytes = (id) =>
   Uint8Array.from(atob(document.getElementById(id).textContent), (c) => c.charCodeAt(0));
-const fail = (error) => (document.body.textContent = `This browser cannot show the model: $${error}`);
+const fail = (error) => {
+  document.body.textContent = `This browser cannot show the model: $${error}`;
+};
 window.show = (createViewer) => {
   const contents = Promise.resolve(new Response(bytes("model")));
   createViewer({ container: document.body, contents, ...$options }).then((viewer) => {
@@ -71,7 +86,7 @@ window.show = (createViewer) => {
   }).catch(fail);
 };
 try {
-  const code = new Blob([bytes("viewer")]).stream().pipeThrough(new DecompressionStream("gzip"));
+  const code = new Blob([bytes("code")]).stream().pipeThrough(new DecompressionStream("gzip"));
   const script = document.createElement("script");
   script.type = "module";
   script.textContent = (await new Response(code).text()) + "\\nwindow.show(createViewer);";
@@ -105,14 +120,16 @@ def write_page(
     Without a scene it starts outside of the model.
 
     Returns:
-        The Gaussians as the page has them, in the item's world.
+        The Gaussians as the page has them, for renders with the blur of training, in the item's
+        world.
     """
     model, start, center = item.model, *_start(item)
     check_page_size(len(model))
     placed = _page_from_world(item, start)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "model.sog"
-        write_gaussians(file, transform_gaussians(model, placed), progress, note)
+        shown = _as_trained(model, item.train_views)
+        write_gaussians(file, transform_gaussians(shown, placed), progress, note)
         packed, held = file.read_bytes(), read_gaussians(file)
     ahead = start.world_from_cam[:3, 2]
     distance = max(float((center - start.center) @ ahead), 1e-2 / placed.scale)
@@ -141,7 +158,31 @@ def write_page(
     )
     with atomic_file(path) as partial:
         partial.write_text(text, "utf-8")
-    return transform_gaussians(held, placed.inverse)
+    return _as_trained(transform_gaussians(held, placed.inverse), item.train_views, undo=True)
+
+
+def _as_trained(model: Gaussians, views: Sequence[View], *, undo: bool = False) -> Gaussians:
+    """Enlarge Gaussians so that the viewer shows them as training did, or undo that.
+
+    Rendering blurs by ``BLUR`` in pixels of the photographs; the viewer by less, in pixels of the
+    window: thin Gaussians become spikes between which one sees the background. So the blur becomes
+    part of their size, that of the training cameras that have them in their image: the mean over
+    these, by the inverse square of the distance. The viewer's narrower kernel is made up for.
+    """
+    xyz, seen = np.asfortranarray(model.means, np.float64), np.zeros(len(model))
+    chosen = () if model.antialiased else evenly_spaced(len(views), BLUR_VIEWS)
+    weights = np.zeros(len(model))
+    for camera in (views[i].camera for i in chosen):
+        inside = points_in_image(camera, xyz)
+        seen[inside.point_idx] += 1
+        weights[inside.point_idx] += camera.K[0, 0] * camera.K[1, 1] / inside.depth**2
+    blur = np.divide(BLUR * seen, weights, out=np.zeros(len(model)), where=seen > 0)[:, None]
+    squares = np.exp(2 * model.scales.astype(np.float64))
+    if undo:
+        squares = np.maximum(squares / KERNEL - blur, 1e-6 * squares)
+    else:
+        squares = KERNEL * (squares + blur)
+    return replace(model, scales=(np.log(squares) / 2).astype(np.float32))
 
 
 def _start(item: ViewerItem) -> tuple[Camera, Float64[np.ndarray, " 3"]]:
