@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -367,7 +367,13 @@ def _print_next(job: _Job) -> None:
     options = job.options
     if job.is_page:
         link = visible(options.output.resolve().as_uri())
-        print_pairs("next", [("open it in a browser, here or wherever you send it", link)])
+        own = {each.name for each in fields(options)} - {"model", "output", "overwrite"}
+        same = any(getattr(options, name) != getattr(Options, name) for name in own)
+        label = f"for SuperSplat's editor{', with the same options' * same}"
+        sog = quoted(options.output.with_suffix(".sog"))
+        packed = f"splatseed export {quoted(options.model)} -o {sog}"
+        opened = "open it in a browser, here or wherever you send it"
+        print_pairs("next", [(opened, link), (label, packed)])
         return
     rows = [("look at it", f"splatseed view {quoted(options.output)}")]
     if job.transform is None:  # else its scene is elsewhere
