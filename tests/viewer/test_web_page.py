@@ -85,8 +85,8 @@ def test_the_page_starts_at_an_upright_training_camera(page, tmp_path):
     pitch = -view.camera.cam_from_world[2, 1]
     assert pitch == pytest.approx(nearest.world_from_cam[:3, 2] @ up, abs=1e-6)
     # The whole image fits into a window of 3 by 2.
-    for focal, size, window in zip(np.diag(nearest.K), (nearest.width, nearest.height), (600, 400)):
-        assert size / focal <= window / view.camera.K[0, 0] * (1 + 1e-6)
+    assert nearest.width / nearest.K[0, 0] <= 600 / view.camera.K[0, 0] * (1 + 1e-6)
+    assert nearest.height / nearest.K[1, 1] <= 400 / view.camera.K[1, 1] * (1 + 1e-6)
     assert parts_of(path)[0]["settings"]["background"]["color"] == [10 / 255, 20 / 255, 60 / 255]
 
 
@@ -120,15 +120,14 @@ def test_gaussians_have_the_blur_of_training(page, tmp_path):
 
 def test_the_gaussians_returned_are_those_of_the_page_in_the_world(page):
     _, item, shown = page
-    order = [np.lexsort(np.round(each.means, 2).T) for each in (shown, item.model)]
     for field in ("means", "scales"):
-        ours, theirs = (getattr(m, field)[o] for m, o in zip((shown, item.model), order))
-        assert np.median(np.abs(ours - theirs)) < 0.02, field
+        ours, theirs = (np.sort(getattr(model, field), axis=0) for model in (shown, item.model))
+        np.testing.assert_allclose(ours, theirs, atol=0.05, err_msg=field)
 
 
 @pytest.mark.skipif(browser.CHROMIUM is None, reason="Chromium is not installed")
 def test_a_browser_draws_the_page_from_disk_as_splatseed_renders(page, tmp_path):
-    path, item, shown = page
+    path = page[0]
     with served_page(tmp_path / "profile", path) as opened:
         loaded = "!!window.viewer?.state.loaded && viewer.state.cameraMode === 'orbit'"
         assert waits_for(lambda: opened.run(loaded), 60)

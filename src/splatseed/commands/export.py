@@ -177,10 +177,10 @@ def _checked(options: Options) -> _Job:
     return _Job(options, path, name, config, scene, crop, transform, budget)
 
 
-def _split(job: _Job) -> dict[str, int]:
+def _split(job: _Job) -> dict[str, Any]:
     """Return the options of the run that choose the views and their size, as far as known."""
     options = {name: job.config.get(name) for name in ("data_factor", "test_every")}
-    return {name: value for name, value in options.items() if isinstance(value, int)}
+    return {name: value for name, value in options.items() if isinstance(value, int | float)}
 
 
 def _views(job: _Job, gaussians: Gaussians, progress: Progress, note: Note) -> ModelViews | None:
@@ -388,7 +388,7 @@ def _scoring_command(job: _Job) -> str:
     scene = str(job.scene) if job.scene is not None else scene
     words = ["splatseed evaluate", quoted(options.output)]
     words += ["--scene", quoted(scene) if isinstance(scene, str) else "SCENE"]
-    if not isinstance(factor, int):
+    if not isinstance(factor, int | float):
         text = "Score it at the size of training: N is the --data-factor of the run."
         print_note(Finding("unknown-data-factor", text, "info"))
         words += ["--data-factor", "N"]

@@ -13,10 +13,11 @@ import numpy as np
 from splatseed.console import print_note, print_pairs
 from splatseed.depth.settings import PER_POINT
 from splatseed.findings import Finding
+from splatseed.io.downsampling import reduced_size
 from splatseed.io.staging import read_manifest
 from splatseed.io.transforms_layout import Layout
 from splatseed.lens import undistort_command, undistorted_folder
-from splatseed.photos.sizes import TRAINED_SIDE, factor_for_size
+from splatseed.photos.sizes import default_factor, factor_for_side, factor_for_size
 from splatseed.progress import available_cpus
 from splatseed.scene import Image, Scene
 from splatseed.seeding.advice import AS_IT_IS, SEEDED, Advice, is_distorted, untrainable
@@ -71,16 +72,18 @@ class Planned(NamedTuple):
         budget: str | None = None,
         max_steps: int = FULL_RUN,
         trainer: TrainerName = "splatseed",
-        long_side: int = TRAINED_SIDE,
+        long_side: int | None = None,
     ) -> Planned:
         """Plan the training of a scene by the options of ``info``.
 
         The other trainers densify as 3DGS does by default.
         """
         images = scene.images
-        factor = factor_for_size(images, long_side) if images else 1
+        factor: float = default_factor(images)
+        if images and long_side is not None:
+            factor = factor_for_side(images, long_side)
         lenses = [image.lens for image in images]
-        sizes = [(lens.width // factor, lens.height // factor) for lens in lenses]
+        sizes = [reduced_size(lens.width, lens.height, factor) for lens in lenses]
         pixels = round(float(np.median([w * h for w, h in sizes]))) if sizes else BUDGET
         number, flags = max(2, min(BUDGET, pixels)), ""
         if budget is not None:

@@ -98,7 +98,8 @@ def options_for_an_hour(
         per_pixel: Whether the budget follows the pixels of the photographs.
     """
     slower = now.seconds / step_seconds(now.device, now.gaussians, now.pixels)
-    factors = range(settings.factor, max(settings.factor, long_side // MIN_SIDE) + 1)
+    smaller_ones = range(math.floor(settings.factor) + 1, long_side // MIN_SIDE + 1)
+    factors = (settings.factor, *smaller_ones)
     fewer = min(FEWER_STEPS, settings.max_steps)
     tried = [(steps, factor) for steps in (settings.max_steps, fewer) for factor in factors]
     for steps, factor in tried:

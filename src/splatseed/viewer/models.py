@@ -60,7 +60,7 @@ class ViewerItem:
     name: str
     scene: Scene | None = None
     gaussians: Gaussians | None = None
-    data_factor: int = 1
+    data_factor: float = 1
     test_every: int = 8
     findings: tuple[Finding, ...] = ()
     moved: Similarity | None = None
@@ -127,7 +127,7 @@ def open_item(path: StrPath, scene_path: Path | None = None) -> ViewerItem:
         )
     scene = scene_at(scene_path) or scene_of_run(folder)
     config = folder.read_config()
-    factor, every = (int(config.get(n) or d) for n, d in (("data_factor", 1), ("test_every", 8)))
+    factor, every = float(config.get("data_factor") or 1), int(config.get("test_every") or 8)
     gaussians, moved = read_gaussians(folder.gaussians, findings.append), None
     if scene is not None:
         own = has_run_poses(config, scene)
