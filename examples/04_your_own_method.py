@@ -2,8 +2,8 @@
 
 python examples/04_your_own_method.py
 
-It is used like any other. docs/methods.md ("Your own method") shows how a package registers it, so
-that METHODS and ``splatseed upsample --method`` know it by name.
+It is used like any other: ``splatseed upsample --method examples/04_your_own_method.py:Jitter``.
+docs/methods.md ("Your own method") shows how a package registers it under a short name.
 """
 
 from dataclasses import dataclass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from argparse import ArgumentParser
 from typing import Any, NamedTuple
@@ -9,7 +10,10 @@ from typing import Any, NamedTuple
 import tyro
 
 from splatseed.cli import main
-from splatseed.commands.options import CONFIG
+from splatseed.commands.options import CONFIG, with_reporting
+
+EXPECTED = re.compile(r"^(?:note: .*|.*\n(?:  -> .*\n?)+)\n?", re.MULTILINE)
+"""Notes and plans on stderr."""
 
 
 class Run(NamedTuple):
@@ -18,6 +22,11 @@ class Run(NamedTuple):
     code: int
     out: str
     err: str
+
+    @property
+    def unexpected(self) -> str:
+        """What is on stderr besides notes and plans."""
+        return EXPECTED.sub("", self.err)
 
 
 def exit_code(*words: object) -> int:
@@ -33,7 +42,7 @@ def parser_of(kind: type[Any]) -> ArgumentParser:
     """A dataclass's command line as argparse has it, whose options can be listed."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
-        return tyro.extras.get_parser(kind, config=CONFIG)
+        return tyro.extras.get_parser(with_reporting(kind), config=CONFIG)
 
 
 def options_of(kind: type[Any]) -> list[str]:

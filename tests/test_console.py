@@ -21,6 +21,7 @@ from splatseed.console import (
     show_extraction,
     stage_display,
 )
+from splatseed.findings import Finding
 from splatseed.progress import extraction_progress, silent
 from splatseed.text import quoted, visible
 
@@ -156,9 +157,9 @@ LITERAL = (LONG, "[bold]no markup[/bold]", "a [3, 4] b", "3 x 4 = 12.5")
 @pytest.mark.parametrize(("text", "shown"), [*zip(LITERAL, LITERAL, strict=True), (EVIL, SHOWN)])
 def test_text_is_printed_as_it_is_on_one_line(text, shown, capsys):
     print_pairs(text, [("label", text), ("", text)])
-    print_note(text)
+    print_note(Finding("a-kind", text))
     print_table(text, ("image", *(f"column {i}" for i in range(8))), [(text, *"12345678")])
-    out = capsys.readouterr().out
+    out = "".join(capsys.readouterr())
     assert sum(shown in line for line in out.splitlines()) == 6  # also in a table in a file
     assert "\x1b" not in out
 
@@ -198,9 +199,10 @@ def test_a_shell_reads_quoted_names_back():
 
 
 def test_arguments_of_the_library_are_printed_as_options(capsys):
-    console.print_note("Pass `data_factor=1`, `scene` or `cap_max=9`; not a`b`, `A` or `a b`.")
+    text = "Pass `data_factor=1`, `scene` or `cap_max=9`; not a`b`, `A` or `a b`."
+    print_note(Finding("a-kind", text))
     said = "Pass --data-factor 1, --scene or --budget 9; not a--b, `A` or `a b`."
-    assert capsys.readouterr().out == f"note: {said}\n"
+    assert capsys.readouterr().err == f"note: {said}\n"
     options = {
         "`overwrite=True`": "--overwrite",
         "`depth.align=False`": "--depth.no-align",

@@ -98,7 +98,11 @@ def test_what_to_install_is_for_this_python_and_for_the_whole_extra(monkeypatch,
         "'torch>=2.5' 'gsplat>=1.5.3,<1.6' 'torchmetrics>=1.4' 'flip-evaluator>=1.7' 'pandas>=2.2' "
         "'jinja2>=3.1'"
     )
-    assert caught.value.fix.startswith(f"Install it (extra train): {start} {wanted}.")
+    assert caught.value.fix == (
+        f"Install it (extra train): {start} {wanted}. On a machine without a GPU, PyTorch's CPU "
+        f"build suffices: {start} {wanted} "
+        "--extra-index-url https://download.pytorch.org/whl/cpu."
+    )
     tested.touch()
     upgraded = install_command("pycolmap", upgrade=True)
     assert upgraded == f"{start} --upgrade -c '{tested}' 'pycolmap>=4.0' 'imageio-ffmpeg>=0.6'"
@@ -319,6 +323,7 @@ def _assert_explained(each, where):
 def test_the_front_door_lists_what_the_packages_promise():
     promised = "METHODS Camera PointCloud Scene SplatseedError add_cover load_scene stereo_depths"
     promised += " upsample write_scene Run evaluate train Gaussians read_gaussians render"
+    promised += " __version__"
     assert sorted(splatseed.__all__) == sorted(promised.split())
     assert all(getattr(splatseed, name) for name in splatseed.__all__)
 

@@ -61,7 +61,26 @@ def test_an_error_in_a_thread_comes_out():
 def test_threads_are_one_per_available_cpu_or_the_limit(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 3}, raising=False)
     monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        monkeypatch.delenv(name, raising=False)
     assert num_threads() == 2
     limit = thread_limit.set(1)
     assert num_threads() == 1
     thread_limit.reset(limit)
+
+
+def test_threads_are_limited_by_the_variables_of_openmp_and_numba_and_by_a_container(
+    monkeypatch, tmp_path
+):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    monkeypatch.setattr("splatseed.progress._CPU_MAX", tmp_path / "cpu.max")
+    for omp, numba, jobs, threads in (
+        ("", "", 1, 8), ("", "", 3, 2), ("", "", 99, 1), ("3", "", 1, 3), ("3,2", "", 1, 3),
+        ("", "2", 1, 2), ("3", "2", 1, 2), ("64", "", 1, 8), ("3", "", 4, 2), ("many", "0", 1, 8),
+    ):  # fmt: skip
+        monkeypatch.setenv("OMP_NUM_THREADS", omp)
+        monkeypatch.setenv("NUMBA_NUM_THREADS", numba)
+        assert num_threads(jobs) == threads, (omp, numba, jobs)
+    for quota, cpus in (("max 100000", 8), ("250000 100000", 2), ("50000 100000", 1)):
+        (tmp_path / "cpu.max").write_text(f"{quota}\n")
+        assert num_threads() == cpus

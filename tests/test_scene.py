@@ -97,7 +97,18 @@ def test_features_of_points_that_went_belong_to_none(scene):
     assert (others.images[0].observations.point_ids == NO_POINT).all()
 
 
-@pytest.mark.parametrize("test_every", [0, -8, 1, 2.5])
+@pytest.mark.parametrize(("count", "tests"), [(3, 0), (11, 0), (12, 2), (17, 3)])
+def test_of_few_images_none_tests_by_default(count, tests):
+    images = tuple(_image(f"{i:02}.jpg") for i in reversed(range(count)))
+    scene = Scene(PointCloud.empty(), images)
+    train, test = scene.split(scene.default_test_every)
+    assert (len(train), len(test)) == (count - tests, tests)
+    assert len(scene.split()[1]) == 1 + (count - 1) // 8
+    every = scene.split(0)
+    assert ([image.name for image in every[0]], every[1]) == (sorted(i.name for i in images), ())
+
+
+@pytest.mark.parametrize("test_every", [-8, 1, 2.5])
 def test_a_split_that_leaves_nothing_to_train_on_is_refused(test_every):
     with pytest.raises(ParameterError, match="test_every as a whole number of 2 or more"):
         Scene(PointCloud.empty(), (_image("a.jpg"),)).split(test_every)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import sys
 import threading
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
@@ -13,7 +15,14 @@ from typing import NoReturn
 
 from rich.table import Table
 
-from splatseed.console import ERR, OUT, show_extraction, with_options
+from splatseed.console import (
+    OUT,
+    print_message,
+    print_report,
+    session,
+    show_extraction,
+    with_options,
+)
 from splatseed.errors import SplatseedError
 from splatseed.requirements import version_of
 from splatseed.runtime.environment import set_thread_defaults
@@ -38,12 +47,15 @@ COMPLETION = "--tyro-print-completion"
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run ``splatseed VERB ...``.
-
-    Exit codes: 0, 2 for an error of the input or the machine, 130 or 143 after Ctrl-C or SIGTERM.
-    """
+    """Run ``splatseed VERB ...``; docs/program.md has the exit codes."""
     words = sys.argv[1:] if arguments is None else arguments
     set_thread_defaults()
+    with session():
+        _run(words)
+
+
+def _run(words: list[str]) -> None:
+    """Run a verb and print what it reports, or its error."""
     try:
         with _termination_raised(), show_extraction():
             _run_verb(words)
@@ -73,7 +85,7 @@ def main(arguments: list[str] | None = None) -> None:
     except KeyboardInterrupt as stop:
         kept = " ".join(getattr(stop, "__notes__", ()))
         state = f". {kept}" if kept else "; no incomplete output was left"
-        ERR.print(f"\ninterrupted{state}", soft_wrap=True)
+        print_message(f"\ninterrupted{state}", logging.WARNING)
         sys.exit(exit_code(stop))
 
 
@@ -81,7 +93,12 @@ def _run_verb(words: list[str]) -> None:
     verb = words[0] if words else "--help"
     if verb in VERBS:
         # Only this verb is imported, so that --help does not wait for Numba.
-        import_module(f"splatseed.commands.{verb}").run(words[1:])
+        try:
+            import_module(f"splatseed.commands.{verb}").run(words[1:])
+        except SystemExit:  # with another exit code than 0, perhaps with results
+            print_report()
+            raise
+        print_report()
     elif verb in {"-h", "--help"}:
         _print_help()
     elif verb in {"-V", "--version"}:
@@ -89,11 +106,12 @@ def _run_verb(words: list[str]) -> None:
     elif verb.partition("=")[0] == COMPLETION:
         import tyro  # noqa: PLC0415  (takes a while to load)
 
-        from splatseed.commands.options import CONFIG  # noqa: PLC0415  (likewise)
+        from splatseed.commands.options import CONFIG, with_reporting  # noqa: PLC0415  (likewise)
 
         modules = {verb: import_module(f"splatseed.commands.{verb}") for verb in VERBS}
         verbs = {verb: module.Options for verb, module in modules.items()}
         verbs["upsample"] = modules["upsample"].full_options()
+        verbs = {verb: with_reporting(options) for verb, options in verbs.items()}
         tyro.extras.subcommand_cli_from_dict(verbs, prog="splatseed", args=words, config=CONFIG)
     else:
         meant = did_you_mean(verb, [*VERBS, "--help", "--version", COMPLETION])
@@ -127,8 +145,10 @@ def _ends_gpu_memory(error: RuntimeError) -> bool:
 
 def _fail(message: str) -> NoReturn:
     """Print an error on stderr, with options for the library's arguments, and exit with 2."""
-    ERR.print("error:", style="bold red", end=" ")
-    ERR.print(visible(with_options(" ".join(message.splitlines()))), soft_wrap=True)
+    if sys.exc_info()[0] is not None:
+        print_message(traceback.format_exc(), logging.DEBUG)
+    text = visible(with_options(" ".join(message.splitlines())))
+    print_message(text, logging.ERROR, "error")
     sys.exit(2)
 
 

@@ -1,4 +1,4 @@
-"""Print results to stdout, and progress bars to stderr.
+"""Print results to stdout and all else to stderr, for people or for programs (``Reporting``).
 
 If stderr is not a terminal, nothing is drawn; long work prints a line per stage. A stage's time
 runs until the next one starts. Control characters are escaped, so that no file name can colour the
@@ -8,11 +8,24 @@ terminal, move its cursor or rewrite a line.
 from __future__ import annotations
 
 import ast
+import json
+import logging
+import math
 import re
+import sys
 import time
+import traceback
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
-from typing import Any
+from contextlib import (
+    AbstractContextManager,
+    ExitStack,
+    contextmanager,
+    nullcontext,
+    redirect_stdout,
+)
+from dataclasses import asdict, dataclass, is_dataclass
+from pathlib import Path
+from typing import IO, Any
 
 from rich import progress as rich_progress
 from rich.console import Console
@@ -20,7 +33,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from splatseed.findings import Finding
+from splatseed.findings import LEVELS, LOGGER, Finding
 from splatseed.progress import COMPILATION, Progress, StageTimes, extraction_progress, watched
 from splatseed.text import quoted, visible
 
@@ -30,11 +43,61 @@ OPTIONS = {"cap_max": "budget", "seeding": "seeds", "depths": "depth"}
 """Options whose names differ from the arguments they set."""
 
 
+@dataclass(frozen=True)
+class Reporting:
+    """What a command prints; options of every verb."""
+
+    json: bool = False
+    """Print one JSON object to stdout instead: results, findings, next commands."""
+    quiet: bool = False
+    """Print only warnings and errors to stderr."""
+    verbose: bool = False
+    """Also print stages with their times to stderr, and the traceback of an error."""
+    log: Path | None = None
+    """Append to this file what --verbose prints, with date and time."""
+
+
+class _Session(logging.Handler):
+    """A call of the command line: what it prints, its results, and contexts to leave at its end.
+
+    As a handler it prints what the library logs.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.log: IO[str] | None = None
+        self.stdout: IO[str] | None = None  # for ``--json``, away from what other libraries print
+        self.stack: ExitStack | None = None  # None outside of a call
+        self.reset()
+
+    def reset(self) -> None:
+        self.shown = logging.INFO
+        self.results: dict[str, Any] = {}
+        self.findings: dict[Finding, None] = {}
+        self.next: list[dict[str, str]] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print a message of the library."""
+        if (finding := getattr(record, "finding", None)) is not None:
+            print_note(finding)
+            return
+        label = "note" if record.levelno >= logging.WARNING else ""
+        print_message(self.format(record), record.levelno, label)
+
+
+_SESSION = _Session()
+
+
 class LiteralConsole(Console):
     """A console without markup, emoji and highlighting that escapes control characters."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(markup=False, emoji=False, highlight=False, **options)
+
+    @property
+    def is_terminal(self) -> bool:
+        """Whether bars may be drawn and lines must be wrapped."""
+        return super().is_terminal and not (self.stderr and _SESSION.shown > logging.INFO)
 
     def render_str(self, text: str, **options: Any) -> Text:
         """Escape control characters but newlines; Rich calls this for every string."""
@@ -49,6 +112,92 @@ LINE_INTERVAL = 30.0
 """Seconds between lines on a running stage, if stderr is not a terminal."""
 MIN_LOGGED_COMPILATION = 3.0
 """Compilations of fewer seconds are not logged."""
+_STYLES = {"note": "yellow", "error": "bold red"}
+
+
+@contextmanager
+def session() -> Iterator[None]:
+    """Print what the library logs while the block runs; then leave the contexts of ``hold``."""
+    level = LOGGER.level
+    LOGGER.addHandler(_SESSION)
+    LOGGER.setLevel(logging.DEBUG)
+    try:
+        with ExitStack() as _SESSION.stack:
+            try:
+                yield
+            except Exception:
+                _SESSION.shown = logging.CRITICAL  # Python prints it
+                print_message(traceback.format_exc(), logging.ERROR)
+                raise
+    finally:
+        LOGGER.removeHandler(_SESSION)
+        LOGGER.setLevel(level)
+        _SESSION.log = _SESSION.stdout = _SESSION.stack = None
+        _SESSION.reset()
+        OUT.quiet = False
+
+
+def hold(context: AbstractContextManager[Any]) -> Any:
+    """Enter a context until the call of the command line ends; outside of a call, do not."""
+    return None if _SESSION.stack is None else _SESSION.stack.enter_context(context)
+
+
+def configure(reporting: Reporting) -> None:
+    """Print what the options ask for until the call of the command line ends.
+
+    Raises:
+        OSError: The log file cannot be written.
+    """
+    if _SESSION.stack is None:
+        return
+    if reporting.json:
+        OUT.quiet, _SESSION.stdout = True, sys.stdout
+        hold(redirect_stdout(sys.stderr))
+    levels = {reporting.verbose: logging.DEBUG, reporting.quiet: logging.WARNING}
+    _SESSION.shown = levels.get(True, logging.INFO)
+    if reporting.log is not None:
+        _SESSION.log = hold(reporting.log.open("a", encoding="utf-8"))
+
+
+def print_message(text: str, level: int = logging.INFO, label: str = "") -> None:
+    """Print a message to stderr and to the log file, each if it takes this level of ``logging``."""
+    if level >= _SESSION.shown:
+        if label:
+            ERR.print(f"{label}:", style=_STYLES[label], end=" ")
+        ERR.print(text, soft_wrap=True)
+    if _SESSION.log is not None:
+        now, name = time.strftime("%Y-%m-%d %H:%M:%S"), logging.getLevelName(level)
+        print(now, name, visible(text, keep="\n"), file=_SESSION.log, flush=True)
+
+
+def add_results(**results: object) -> None:
+    """Add results to the object that ``--json`` prints."""
+    _SESSION.results |= results
+
+
+def print_report() -> None:
+    """With ``--json``, print the results so far with findings and next commands, as one object."""
+    if _SESSION.stdout is not None and _SESSION.results:
+        notes = {"findings": list(_SESSION.findings), "next": _SESSION.next}
+        content = as_json({**_SESSION.results, **notes})
+        print(json.dumps(content, indent=2, allow_nan=False), file=_SESSION.stdout)
+    _SESSION.results = {}
+    (_SESSION.stdout or OUT.file).flush()  # a parent process may wait for it
+
+
+def as_json(value: Any) -> Any:
+    """Convert a value for JSON: a dataclass to an object, a number that is not finite to null."""
+    if is_dataclass(value) and not isinstance(value, type):
+        value = asdict(value)
+    if isinstance(value, Mapping):
+        return {str(key): as_json(each) for key, each in value.items()}
+    if hasattr(value, "tolist"):  # NumPy's
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [as_json(each) for each in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if isinstance(value, str | int | float | None) else str(value)
 
 
 class _Bars(rich_progress.BarColumn):
@@ -62,7 +211,8 @@ class _Bars(rich_progress.BarColumn):
 class _Lines:
     """A ``Progress`` that prints a line when a stage ends, and every ``LINE_INTERVAL`` before."""
 
-    def __init__(self, items: Mapping[str, tuple[int, str]]) -> None:
+    def __init__(self, items: Mapping[str, tuple[int, str]], level: int) -> None:
+        self._level = level
         self._items = items  # by stage: the number of items, and their noun
         self._times: dict[str, tuple[float, float]] = {}  # by stage: its start, its last line
         self._ended = set[str]()
@@ -78,7 +228,8 @@ class _Lines:
         if fraction >= 1:
             self._ended.add(stage)
             done = f" {total:,} {noun}" if total else " done"
-        ERR.print(f"{stage}:{done}, {now - start:.{0 if now - start >= 10 else 1}f} s")
+        seconds = f"{now - start:.{0 if now - start >= 10 else 1}f} s"
+        print_message(f"{stage}:{done}, {seconds}", self._level)
 
 
 class StageClock(StageTimes):
@@ -104,7 +255,7 @@ class StageClock(StageTimes):
 
     def announce(self, finding: Finding) -> None:
         """Print a finding above the bars, before long work."""
-        ERR.print(visible(with_options(str(finding))), soft_wrap=True)
+        print_note(finding)
 
     def expect(self, *stages: str) -> None:
         """Show stages that are still to come."""
@@ -138,7 +289,7 @@ class StageClock(StageTimes):
         since = self.seconds().get(COMPILATION, 0.0) - self._logged
         if since > MIN_LOGGED_COMPILATION:
             self._logged += since
-            ERR.print(f"{COMPILATION} took {since:.0f} s; cached for the next run")
+            print_message(f"{COMPILATION} took {since:.0f} s; cached for the next run")
 
 
 @contextmanager
@@ -150,7 +301,7 @@ def stage_display(
     Args:
         clock: A clock of an earlier block, to continue.
         remaining: Also show the time left, for stages that take minutes.
-        lines: Print a line per stage if stderr is not a terminal.
+        lines: Print a line per stage if stderr is not a terminal; else only ``--verbose`` does.
     """
     clock = StageClock() if clock is None else clock
     # Extraction must not open a second display.
@@ -169,7 +320,8 @@ def _display(clock: StageClock, *, remaining: bool, lines: bool) -> Iterator[Sta
     columns += [left, rich_progress.TimeRemainingColumn()] if remaining else []
     drawn = rich_progress.Progress(*columns, console=ERR, transient=True)
     bar = drawn if ERR.is_terminal else None
-    clock._lines = _Lines(clock._items) if lines and bar is None else None  # noqa: SLF001  (ours)
+    level = logging.INFO if lines and bar is None else logging.DEBUG
+    clock._lines = _Lines(clock._items, level)  # noqa: SLF001  (ours)
     with clock._shown(bar), bar or nullcontext(), watched(clock.compilation):  # noqa: SLF001  (ours)
         yield clock
 
@@ -253,11 +405,23 @@ def print_pairs(title: str, rows: Sequence[tuple[str, str]]) -> None:
         OUT.print(f"  {label:<{width}}  {visible(with_options(value))}", soft_wrap=True)
 
 
+def print_next(commands: Sequence[tuple[str, str]], title: str = "next") -> None:
+    """Print the commands to run next, each with a label."""
+    _SESSION.next += [{"label": label, "command": command} for label, command in commands]
+    print_pairs(title, commands)
+
+
+def add_findings(*findings: Finding) -> None:
+    """Add findings that are printed otherwise to the object that ``--json`` prints."""
+    _SESSION.findings |= dict.fromkeys(findings)
+
+
 def print_note(*findings: Finding) -> None:
-    """Print findings, each once, with options for the library's arguments."""
+    """Print findings to stderr, each once, with options for the library's arguments."""
     for finding in dict.fromkeys(findings):
-        OUT.print("note:", style="yellow", end=" ")
-        OUT.print(visible(with_options(str(finding))), soft_wrap=True)
+        add_findings(finding)
+        text = visible(with_options(str(finding)))
+        print_message(text, LEVELS[finding.severity], "note")
 
 
 def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -269,7 +433,8 @@ def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]
         table.add_row(*map(visible, row))
     _print_title(title)
     # In a file, no name needs to be cut off at an edge.
-    (OUT if OUT.is_terminal else LiteralConsole(file=OUT.file, width=FILE_WIDTH)).print(table)
+    wide = LiteralConsole(file=OUT.file, width=FILE_WIDTH, quiet=OUT.quiet)
+    (OUT if OUT.is_terminal else wide).print(table)
 
 
 def _print_title(title: str) -> None:

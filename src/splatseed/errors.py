@@ -7,7 +7,7 @@ The message says in one line what was expected, what was found, and how to fix i
     │   ├── SceneNotFoundError (FileNotFoundError), SceneFormatError, OutputError
     │   └── PointCloudError, ParameterError (ValueError)
     │       └── UnknownNameError (KeyError)
-    └── ReconstructionError, MissingDependencyError, TaskLostError
+    └── ReconstructionError, MissingDependencyError, PluginError, TaskLostError
 
 A message names an argument in backticks, as Python code: `ratio`, `max_steps=7000`,
 `overwrite=True`. The command line prints the option instead (`--ratio`, `--max-steps 7000`,
@@ -42,9 +42,9 @@ class SplatseedError(Exception):
         """Return the message; ``KeyError`` would quote it."""
         return str(self.args[0])
 
-    def __reduce__(self) -> tuple[partial[SplatseedError], tuple[str]]:
-        """Make errors with keyword-only arguments picklable."""
-        return partial(type(self), found=self.found, fix=self.fix), (self.expected,)
+    def __reduce__(self) -> tuple[partial[SplatseedError], tuple[str], dict[str, object]]:
+        """Make errors with keyword-only arguments picklable; keeps their notes."""
+        return partial(type(self), found=self.found, fix=self.fix), (self.expected,), vars(self)
 
 
 class InputError(SplatseedError):
@@ -81,6 +81,10 @@ class ReconstructionError(SplatseedError):
 
 class MissingDependencyError(SplatseedError):
     """An optional package is not installed."""
+
+
+class PluginError(SplatseedError):
+    """The method of another package failed; ``__cause__`` is its exception."""
 
 
 class TaskLostError(SplatseedError):

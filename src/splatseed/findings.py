@@ -7,6 +7,7 @@ messages in ``errors``: an argument stands in backticks.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -14,6 +15,11 @@ from typing import Literal, get_args
 Severity = Literal["info", "warning", "error"]
 """``info``: what was done or chosen; ``warning``: data was repaired, left out, or looks wrong;
 ``error``: what the user asked for cannot give a right result."""
+
+LEVELS = {"info": logging.INFO, "warning": logging.WARNING, "error": logging.ERROR}
+"""The level of ``logging`` for each severity."""
+LOGGER = logging.getLogger("splatseed")
+"""The parent of all loggers of splatseed."""
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,12 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from pathlib import Path
 from typing import TypeAlias
 
-from splatseed.findings import Finding
+from splatseed.findings import LEVELS, LOGGER, Finding
 
 Progress: TypeAlias = Callable[[str, float], None]
 Note: TypeAlias = Callable[[Finding], None]
@@ -23,7 +24,8 @@ Note: TypeAlias = Callable[[Finding], None]
 extraction_progress: ContextVar[Progress] = ContextVar("extraction_progress")
 """Called while a video or archive is extracted (``io.recordings``); unset: shown nowhere."""
 thread_limit: ContextVar[int | None] = ContextVar("thread_limit", default=None)
-"""Maximum threads of ``in_threads``; None for one per available CPU."""
+"""Threads of ``in_threads``; None for the default of ``num_threads``."""
+_CPU_MAX = Path("/sys/fs/cgroup/cpu.max")
 
 
 COMPILATION = "compiling kernels"
@@ -36,6 +38,11 @@ def silent(stage: str, fraction: float) -> None:
 
 def silent_note(finding: Finding) -> None:
     """Ignore the finding."""
+
+
+def log_note(finding: Finding) -> None:
+    """Log the finding, by default of the public functions; the record has it as ``finding``."""
+    LOGGER.log(LEVELS[finding.severity], "%s", finding, extra={"finding": finding})
 
 
 class StageTimes:
@@ -81,16 +88,27 @@ def blocks(total: int, size: int, stage: str, progress: Progress) -> Iterator[tu
 
 
 def available_cpus() -> int:
-    """Return how many CPUs this process may use."""
+    """Return how many CPUs this process may use, by its affinity and its container's quota."""
     try:
-        return len(os.sched_getaffinity(0))
+        count = len(os.sched_getaffinity(0))
     except AttributeError:  # not on Windows and macOS
-        return os.cpu_count() or 1
+        count = os.cpu_count() or 1
+    with suppress(OSError, ValueError):  # "max": no quota
+        quota, period = map(int, _CPU_MAX.read_text("ascii").split())
+        count = min(count, max(1, round(quota / period)))
+    return count
 
 
-def num_threads() -> int:
-    """Return the number of threads to compute with: ``thread_limit``, or one per available CPU."""
-    return thread_limit.get() or available_cpus()
+def num_threads(jobs: int = 1) -> int:
+    """Return the number of threads to compute with.
+
+    That is ``thread_limit``, or an equal share of the available CPUs among ``jobs`` processes, and
+    at most what ``OMP_NUM_THREADS`` and ``NUMBA_NUM_THREADS`` allow a process.
+    """
+    values = (os.environ.get(f"{name}_NUM_THREADS", "") for name in ("OMP", "NUMBA"))
+    first = (value.partition(",")[0].strip() for value in values)  # OpenMP's "4,2" nests
+    limits = [int(value) for value in first if value.isdecimal() and int(value)]
+    return thread_limit.get() or min([max(1, available_cpus() // jobs), *limits])
 
 
 def in_threads(

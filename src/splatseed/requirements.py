@@ -34,6 +34,7 @@ EXTRAS = {
 }
 """Requirements by extra, as in pyproject.toml; messages list them, since an extra can only be
 installed from splatseed's folder. A package belongs to the first extra that has it."""
+_CPU_BUILDS = "https://download.pytorch.org/whl/cpu"
 _TESTED = Path(__file__).parents[2] / "constraints.txt"
 """The tested versions; absent unless splatseed runs from its own folder."""
 
@@ -50,7 +51,8 @@ def require(*packages: str) -> None:
         what = "it" if len(missing) == 1 else "them"
         advice = f"Install {what} (extra {extras}): {install_command(*missing)}."
         if "torch" in missing:
-            advice += " On a machine without a GPU, PyTorch's CPU build suffices."
+            advice += " On a machine without a GPU, PyTorch's CPU build suffices: "
+            advice += f"{install_command(*missing)} --extra-index-url {_CPU_BUILDS}."
         raise MissingDependencyError(
             f"the package{'s' * (len(packages) > 1)} {', '.join(packages)}",
             found=f"no {', no '.join(missing)}",
@@ -64,6 +66,9 @@ def version_of(package: str) -> str | None:
         return version(package)
     except PackageNotFoundError:
         return None
+
+
+__version__ = version_of("splatseed") or "unknown"
 
 
 def versions_of(packages: Iterable[str]) -> dict[str, str]:

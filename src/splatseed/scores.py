@@ -31,9 +31,9 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class EvalResult:
-    """Scores of test views, and their means."""
+    """Scores of test views, and their means; NaN or None without test views."""
 
-    per_image: tuple[ViewScore, ...]  # one or more, in the views' order
+    per_image: tuple[ViewScore, ...]  # in the views' order; none if nothing was held out
     lpips_net: str | None = None  # None if not measured
     lpips_reason: str = NOT_REQUESTED  # why LPIPS was not measured; empty if it was
     num_gaussians: int | None = None  # rendered; None if the renderer does not tell
@@ -80,7 +80,7 @@ class EvalResult:
         return _mean(score.seconds for score in self.per_image)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON; infinity becomes None."""
+        """Return plain values for JSON; infinity and NaN become None."""
         names = ("psnr", "cc_psnr", "ssim", "flip", "lpips", "covisible_psnr", "covisible_share")
         means = (*names, "render_seconds")
         return {
@@ -132,6 +132,8 @@ class TrainingResult:
 
 def _mean(values: Iterable[float]) -> float:
     listed = list(values)
+    if not listed:
+        return math.nan
     return math.fsum(listed) / len(listed) if all(map(math.isfinite, listed)) else sum(listed)
 
 

@@ -91,10 +91,13 @@ Settings = TypeVar("Settings")
 def change_settings(settings: Settings, name: str, values: Mapping[str, Any]) -> Settings:
     """Return a copy of a dataclass of settings with some of its fields replaced.
 
+    Anything else, such as a function, has no fields.
+
     Raises:
         ParameterError: There is no such field; the message calls fields "parameters of ``name``".
     """
-    known = [field.name for field in dataclasses.fields(settings)]  # type: ignore[arg-type]  # a dataclass
+    fields = dataclasses.fields(settings) if dataclasses.is_dataclass(settings) else ()
+    known = [field.name for field in fields]
     for given in values:
         if given not in known:
             raise ParameterError(
@@ -102,7 +105,7 @@ def change_settings(settings: Settings, name: str, values: Mapping[str, Any]) ->
                 found=repr(given),
                 fix=did_you_mean(given, known).strip() or "Choose one of these.",
             )
-    changed: Settings = dataclasses.replace(settings, **values)  # type: ignore[type-var]  # likewise
+    changed: Settings = dataclasses.replace(settings, **values) if known else settings  # type: ignore[type-var]
     return changed
 
 

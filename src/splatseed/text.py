@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import traceback
 import unicodedata
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
@@ -57,6 +58,13 @@ def numeric_order(name: str) -> list[str | int]:
         ['9.jpg', '10.jpg', '010b.jpg']
     """
     return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d+)", name))]
+
+
+def describe_exception(error: Exception) -> str:
+    """Describe an exception of another's code for its author, with the line that raised it."""
+    *_, last = traceback.extract_tb(error.__traceback__)
+    text = " ".join(f"{type(error).__name__}: {error}".split())
+    return f"{text} ({last.filename}, line {last.lineno})"
 
 
 def describe_error(error: Exception) -> str:

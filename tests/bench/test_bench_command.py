@@ -61,7 +61,8 @@ def test_runs_everything_once_and_a_failed_run_ends_nothing_else(here, bench, pl
         methods=("sfm", "linear", "depth"), repeats=1, parameters={"depth": {"min_points": 9999}}
     )
     code, out, err = bench("--plan", plan, "-o", folder)
-    assert (code, err) == (1, "")
+    assert code == 1
+    assert "[3/3] room" in err
     assert re.search(r"room, depth 2x, none, repeat 1 +expected .*9,?999", out)
     assert f"splatseed bench report {folder}" in out
     assert re.search(r"linear 2x +none +\d+\.\d\d +[+-]\d", out)
@@ -73,13 +74,43 @@ def test_runs_everything_once_and_a_failed_run_ends_nothing_else(here, bench, pl
     }  # fmt: skip
 
     results = {path: path.stat().st_mtime_ns for path in folder.glob("runs/*/result.json")}
-    code, out, _ = bench("-o", folder)  # which tries again what failed
+    code, _, err = bench("-o", folder)  # which tries again what failed
     assert code == 1
-    assert "2 done, 1 failed" in out
+    assert "2 done, 1 failed" in err
     assert results == {path: path.stat().st_mtime_ns for path in results}
     calls = read_calls(folder)
     assert [each["command"].split()[:2] for each in calls] == [["splatseed", "bench"]] * 2
     assert {"cpu", "cores", "python", "versions"} <= calls[0].keys()
+
+
+def test_a_changed_method_in_a_file_is_run_again_and_the_change_is_named(
+    here, bench, plan_path, tmp_path
+):
+    file, folder = tmp_path / "mine.py", tmp_path / "B"
+    code = (
+        "def shifted(scene, num_new, rng, progress):\n"
+        "    rows = rng.integers(0, len(scene.points), num_new)\n"
+        "    return scene.points.xyz[rows] + {shift}, scene.points.rgb[rows]\n"
+    )
+    file.write_text(code.format(shift=0.01))
+    words = ("--plan", plan_path(repeats=1), "--methods", "sfm", f"{file}:shifted", "-o", folder)
+    run = bench(*words)
+    assert (run.code, "The code has changed" in run.err) == (0, False)
+    first = {path.parent.name for path in folder.glob("runs/*/result.json")}
+    file.write_text(code.format(shift=0.02))
+    code_, out, err = bench("-o", folder)  # by the absolute path in plan.toml
+    assert code_ == 0
+    assert "2 runs, 1 done, 1 pending" in err
+    assert re.search(r"The code has changed \(1 run to repeat\): method .*mine.py:shifted is", err)
+    second = {path.parent.name for path in folder.glob("runs/*/result.json")}
+    assert len(second - first) == 1
+    code_, out, err = bench("-o", folder)
+    assert "2 runs, 2 done" in err
+    assert "The code has changed" not in err
+    _, out, _ = bench("report", folder)
+    assert "code=" in out
+    file.write_text("def other(): ...\n")
+    assert "no attribute 'shifted'" in bench("-o", folder).err
 
 
 @pytest.mark.slow
@@ -99,8 +130,7 @@ def test_killed_in_training_it_goes_on(here, bench, plan_path, tmp_path):
     fcntl.flock(descriptor, fcntl.LOCK_EX)  # until the run's own process has ended as well
     os.close(descriptor)
     os.utime(left, (0, 0))  # a fresh one may still be somebody's
-    run = bench("-o", folder)
-    assert (run.code, run.err) == (0, "")
+    assert bench("-o", folder).code == 0
     assert [bool(run.result) for run in read_runs(folder)] == [True]
     assert len(list((folder / "runs").iterdir())) == 1  # nothing half-written is left
 

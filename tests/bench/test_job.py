@@ -17,6 +17,7 @@ from splatseed.bench.job import (
     Machine,
     RunOptions,
     execute_runs,
+    local_machine,
     make_seeds,
     open_unchanged,
     run_job,
@@ -28,7 +29,6 @@ from splatseed.cli import main
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.io.ply import write_ply
-from splatseed.requirements import version_of
 from splatseed.splat.covisible import read_covisible
 from splatseed.splat.pictures import BAND
 from splatseed.training.seeds import seeds_digest
@@ -46,7 +46,7 @@ def specs(small_plan, room_path):
         training=dataclasses.replace(small_plan.training, max_steps=4),
     )
     facts = surveyed(room_path, with_depth=True)
-    runs = plan_runs(plan, [facts], "cpu", version_of("splatseed") or "")
+    runs = plan_runs(plan, [facts], "cpu")
     return {run.arm.method: run for run in runs}
 
 
@@ -105,7 +105,7 @@ def test_seeds_are_those_that_the_command_writes(small_plan, own_room, room_of, 
     np.savez(scan, xyz=surfaces.sample(20_000, np.random.default_rng(2)))
     facts = surveyed(own_room, cloud=scan, with_depth=True)
     plan = dataclasses.replace(small_plan, methods=(method,), repeats=1)
-    (spec,) = plan_runs(plan, [facts], "cpu", "1")
+    (spec,) = plan_runs(plan, [facts], "cpu")
     seeds, seconds = make_seeds(open_unchanged(spec.scene), spec)
     files = {"DEPTH": spec.scene.depth, "SCAN": str(scan)}
     words = [files.get(word, word) for word in COMMANDS[method]]
@@ -122,7 +122,7 @@ def _budgeted(small_plan, room_path, method, budget, strategy="none"):
         small_plan, methods=(method,), ratios=(), budgets=(budget,), repeats=1,
         strategies=(strategy,),
     )  # fmt: skip
-    (spec,) = plan_runs(plan, [surveyed(room_path)], "cpu", "1")
+    (spec,) = plan_runs(plan, [surveyed(room_path)], "cpu")
     return spec
 
 
@@ -169,6 +169,25 @@ def test_a_scene_that_has_changed_fails_its_run_alone_and_is_recorded(
     assert "open_unchanged" in error["traceback"]
     (done,) = execute_runs(tmp_path, [specs["sfm"]], here(in_process), RunOptions())
     assert read_run(tmp_path, broken).result == done.result  # which takes the error's place
+
+
+def test_processes_get_the_threads_that_the_user_allows(monkeypatch):
+    monkeypatch.setattr("splatseed.progress.available_cpus", lambda: 8)
+    monkeypatch.setenv("OMP_NUM_THREADS", "")
+    monkeypatch.setenv("NUMBA_NUM_THREADS", "3")
+    for jobs, threads in ((1, 3), (4, 2)):
+        machine = local_machine(jobs, "cpu")
+        assert machine.threads == threads
+        environment = machine.workers._free.get()
+        assert environment["OMP_NUM_THREADS"] == environment["NUMBA_NUM_THREADS"] == f"{threads}"
+
+
+def test_code_that_changed_since_the_plan_makes_no_run(specs, tmp_path):
+    for changed in ({"version": "0.0.1"}, {"method_version": "1.0+0123456789ab"}):
+        spec = dataclasses.replace(specs["linear"], **changed)
+        with pytest.raises(ParameterError, match="as it was when the benchmark was planned"):
+            run_job(spec, RunOptions(), tmp_path)
+    assert not (tmp_path / "runs").exists()
 
 
 def test_files_of_the_users_are_left_alone(specs, tmp_path, in_process):

@@ -138,7 +138,7 @@ def test_arms_are_all_combinations_and_the_original_cloud_once():
 def test_runs_repeat_only_when_all_have_been_run(small_plan, room_path):
     plan = dataclasses.replace(small_plan, strategies=("none", "default"), repeats=3)
     facts = surveyed(room_path)
-    runs = plan_runs(plan, [facts, dataclasses.replace(facts, name="other")], "cpu", "1")
+    runs = plan_runs(plan, [facts, dataclasses.replace(facts, name="other")], "cpu")
     assert [run.repeat for run in runs] == [0] * 8 + [1] * 8 + [2] * 8
     assert len({run.key for run in runs}) == 24
     assert runs[0].arm.method == SFM
@@ -147,11 +147,11 @@ def test_runs_repeat_only_when_all_have_been_run(small_plan, room_path):
 
 def test_depth_needs_maps_and_never_sees_the_test_photographs(small_plan, room_path, tmp_path):
     plan = dataclasses.replace(small_plan, methods=("sfm", "depth"), repeats=1)
-    without = plan_runs(plan, [surveyed(room_path)], "cpu", "1")
+    without = plan_runs(plan, [surveyed(room_path)], "cpu")
     assert [run.arm.method for run in without] == [SFM]
     facts = surveyed(room_path, with_depth=True)
     assert facts.depth == str(room_path)
-    _, depth = plan_runs(plan, [facts], "cpu", "1")
+    _, depth = plan_runs(plan, [facts], "cpu")
     assert depth.parameters == {"test_every": plan.training.test_every}
     assert depth.scene.depth_digest == facts.depth_digest
     with pytest.raises(SceneNotFoundError, match="folder of depth maps"):
@@ -163,9 +163,9 @@ def test_a_scan_is_part_of_what_its_methods_depend_on(small_plan, room_path, tmp
     scan = tmp_path / "scan.xyz"
     scan.write_text("1 2 3\n" * 9)
     plan = dataclasses.replace(small_plan, methods=methods, repeats=1)
-    (plain,) = plan_runs(plan, [surveyed(room_path)], "cpu", "1")
+    (plain,) = plan_runs(plan, [surveyed(room_path)], "cpu")
     facts = surveyed(room_path, cloud=scan)
-    sfm, *others = runs = plan_runs(plan, [facts], "cpu", "1")
+    sfm, *others = runs = plan_runs(plan, [facts], "cpu")
     assert sfm.key == plain.key
     assert {run.scene.cloud for run in others} == {str(scan)}
     every = plan.training.test_every
@@ -173,7 +173,7 @@ def test_a_scan_is_part_of_what_its_methods_depend_on(small_plan, room_path, tmp
         {"test_every": every}, {"test_every": every, "cloud.test_every": every},
     ]  # fmt: skip
     scan.write_text("1 2 4\n" * 9)
-    changed = plan_runs(plan, [surveyed(room_path, cloud=scan)], "cpu", "1")
+    changed = plan_runs(plan, [surveyed(room_path, cloud=scan)], "cpu")
     assert [run.key in {old.key for old in runs} for run in changed] == [True, False, False]
     (tmp_path / "scan.laz").write_bytes(b"no scan")
     with pytest.raises(SceneFormatError, match=r"scan\.laz"):
@@ -225,7 +225,7 @@ def test_a_budget_is_the_same_number_for_every_arm_of_a_scene():
     )  # fmt: skip
     assert plan.budgets == ("0.25rho", "20000")
     assert Plan(ratios=(), budgets=("50k", "0.5M", " 1 rho")).budgets == ("50000", "500000", "1rho")
-    runs = plan_runs(plan, [FERN, BONSAI], "cpu", "1")
+    runs = plan_runs(plan, [FERN, BONSAI], "cpu")
     assert len(runs) == len({run.key for run in runs}) == 2 * 3 * 2 * 2
     numbers = {(run.scene.name, run.arm.budget): run.settings.cap for run in runs}
     assert numbers == {
@@ -244,7 +244,7 @@ def test_a_fair_budget_thins_no_seeds_that_a_ratio_asks_for():
         "0.25 per pixel of a photograph in training or 12 per point of the scene (the larger)",
     )  # fmt: skip
     plan = Plan(ratios=(4, 8), budgets=(budget,), repeats=1, long_side=800)
-    runs = plan_runs(plan, [FERN, BONSAI], "cpu", "1")
+    runs = plan_runs(plan, [FERN, BONSAI], "cpu")
     caps = {run.scene.name: run.training.cap_max for run in runs}
     assert caps == {"fern": 120_000, "bonsai": 1_320_000}  # by pixels, and by points
     assert all(run.max_seeds >= run.arm.ratio * run.scene.num_points for run in runs)
@@ -297,3 +297,5 @@ def test_budgets_leave_uncapped_strategies_alone():
     assert len(free) == len(equal) == 1 + 5 * 3 * 2 + 3  # sfm, methods, and random's one profile
     with pytest.raises(ParameterError, match="at least one of ratios"):
         dataclasses.replace(plan, ratios=())
+    with pytest.raises(ParameterError, match="test views to compare by"):
+        dataclasses.replace(plan, training=TrainSettings(test_every=0))

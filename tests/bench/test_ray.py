@@ -63,7 +63,7 @@ def test_a_run_whose_node_is_lost_is_done_on_another(nodes, small_plan, tmp_path
     said = splatseed("bench", "--plan", tmp_path / "plan.toml", "-o", tmp_path / "B", *words)
     loser.join()
     assert lost
-    assert (said.code, "Ray, 1 at a time" in said.out) == (0, True), said
-    assert len([line for line in said.out.splitlines() if line.startswith("[")]) == 1
+    assert (said.code, "Ray, 1 at a time" in said.err) == (0, True), said
+    assert len([line for line in said.err.splitlines() if line.startswith("[")]) == 1
     (run,) = read_runs(tmp_path / "B")
     assert run.result is not None

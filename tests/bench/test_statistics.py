@@ -95,8 +95,8 @@ def test_holm_step_by_step(rng):
 
 def test_verdicts():
     for mean, p, df, expected in (
-        (1.0, 0.01, 3, "better"), (-1.0, 0.01, 1, "worse"), (1.0, 0.2, 3, "within noise"),
-        (1.0, 0.2, 2, "too few to tell"),
+        (1.0, 0.01, 3, "better"), (-1.0, 0.01, 3, "worse"), (1.0, 0.2, 3, "within noise"),
+        (1.0, 0.2, 2, "too few to tell"), (-1.0, 0.001, 2, "too few to tell"),
     ):  # fmt: skip
         assert adjusted([Difference(mean, 0.1, df, 4, p)])[0].verdict == expected
     assert adjusted([None]) == (None,)

@@ -211,6 +211,25 @@ def test_a_comparison_has_one_verdict_in_all_tables_and_sentences(scenes):
     assert marks["mean, these scenes"].mark == ""
 
 
+@pytest.mark.parametrize(("scenes", "repeats"), [(FOX, 2), (SCENES[:2], 1), (SCENES[:3], 5)])
+def test_few_scenes_or_repeats_claim_nothing_in_any_table_or_sentence(scenes, repeats):
+    """However large the gain: of two scenes at +0.5 ± 0.001 dB, p is under 0.002."""
+    planted = {"gains": {(SFM, 1): 0.0, ("mls", 8): 0.5}, "noise": 0.001, "repeats": repeats}
+    study = one(runs(scenes=scenes, **planted))
+    base, (row, _) = baseline_of(study), study_tables.arm_table(study).rows
+    assert [cell.mark for cell in row[3:-4:2]] == ["?"] * 3  # PSNR, co-visible PSNR, SSIM
+    assert row[3].value == pytest.approx(0.5, abs=0.01)
+    gain_rows = study_tables.gain_table(study, "none").rows
+    assert gain_rows[-1][1].mark == "?"
+    assert [row[3].mark for row in study_tables.seconds_table(study, base).rows[:1]] == ["?"]
+    by_scene = study_tables.scene_arm_table(study, base).rows
+    of_scenes = "" if repeats == 5 else "?"
+    assert {cell.mark for cell in by_scene[0][2:]} == {of_scenes}
+    (first, *_) = conclude(study)
+    assert "has the highest mean" in first
+    assert "too few to tell" in first
+
+
 def test_too_few_repeats_are_no_noise():
     planted = {"scenes": FOX, "gains": {(SFM, 1): 0.0, ("mls", 8): 0.02}, "noise": 0.1}
     for repeats, mark in ((1, "?"), (2, "?"), (9, "~")):
@@ -247,7 +266,9 @@ def test_the_answer_names_the_worst_scene_and_the_seconds():
     finished = [
         run
         for scene, gain in planted.items()
-        for run in runs(scenes=(scene,), gains={(SFM, 1): 0.0, ("mls", 8): gain}, noise=0.0)
+        for run in runs(
+            scenes=(scene,), gains={(SFM, 1): 0.0, ("mls", 8): gain}, noise=0.0, repeats=4
+        )
     ]
     assert (
         "; on fern, its worst scene, 0.25 dB less. A run takes 20 s" in conclude(one(finished))[0]

@@ -102,7 +102,8 @@ def test_guidelines_are_decided_by_what_was_planted(paper, tmp_path):
     told = dict(zip(guidelines.GUIDELINES, guidelines.verdicts(results.gains(way)), strict=True))
     by_text = {each.text: verdict for each, verdict in told.items()}
     assert by_text["MLS is most often best"].startswith("holds: +0.50 ± 0.00 dB, 8 scenes, p < ")
-    assert by_text["Voronoi suits planar scenes"].startswith("fails: -0.1")
+    # Two planar scenes are too few to tell.
+    assert by_text["Voronoi suits planar scenes"].startswith("not decided here: -0.1")
     assert by_text["Simple methods at low ratios suffice"].startswith("fails: -0.1")
     assert by_text["Benefits rise to 32x indoors"] == "not decided here: not run"
     assert "mls 8" in paper("tables").to_markdown(guidelines.verdict_table(results))

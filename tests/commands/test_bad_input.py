@@ -42,11 +42,12 @@ def _refused(run, *named):
     """Check the rules that all errors obey, and what this one names; returns its text."""
     assert run.code == 2, run
     assert "Traceback" not in run.out + run.err
-    said = " ".join(re.sub("[│╭╮╰╯─]", " ", run.err).split())  # tyro's boxes
-    if run.err.startswith("error: "):
-        assert run.err.startswith("error: expected ")
-        assert run.err.count("\n") == 1
-        assert "; found " in run.err
+    err = run.unexpected
+    said = " ".join(re.sub("[│╭╮╰╯─]", " ", err).split())  # tyro's boxes
+    if err.startswith("error: "):
+        assert err.startswith("error: expected ")
+        assert err.count("\n") == 1
+        assert "; found " in err
     else:
         assert "--help" in said
     for text in named:
@@ -296,7 +297,7 @@ def test_too_few_and_unusable_points(rng, tmp_path, splatseed):
     assert not (tmp_path / "deep").exists()
     run = splatseed("upsample", tmp_path / "some.ply", "-o", tmp_path / "out", "--ratio", 2)
     assert run.code == 0
-    assert "2 points are not finite" in run.out
+    assert "2 points are not finite" in run.err
     assert "2 not finite, 1 duplicate" in run.out
     written = load_scene(tmp_path / "out").points
     assert len(written) == 2 * (100 - 3)
@@ -488,7 +489,7 @@ def test_control_characters_of_names_are_escaped(words, room, tmp_path, splatsee
     output = [] if words == ["info"] else ["-o", tmp_path / f"out{NAME}"]
     run = splatseed(words[0], scene, *words[1:], *output)
     assert run.code == 0, run
-    assert "\x1b" not in run.out
+    assert "\x1b" not in run.out + run.err
 
     assert r"room\x1b[31m:fire:[red]\nx" in run.out
     _refused(splatseed("info", tmp_path / f"no{NAME}"), r"noroom\x1b[31m:fire:[red] x")

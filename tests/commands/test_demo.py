@@ -79,7 +79,7 @@ def test_without_pytorch_the_demo_does_not_train(splatseed, tmp_path, monkeypatc
     monkeypatch.setattr(demo, "methods_for", lambda _: ("auto", "linear"))
     run = splatseed("demo", "--views", 4, "-o", tmp_path / "demo")
     assert run.code == 0, run
-    assert "not trained: no torch installed" in run.out
+    assert "not trained: no torch installed" in run.err
     assert "splatseed evaluate" not in run.out
     assert not (tmp_path / "demo" / "run_sfm").exists()
     assert (tmp_path / "demo" / "geometry.csv").is_file()

@@ -47,7 +47,7 @@ def network(monkeypatch):
 def test_a_network(room, network, tmp_path, splatseed):
     words = ("depth", room, "--model", "tiny", "-o", tmp_path / "d")
     run = splatseed(*words, "--max-size", 80)
-    assert (run.code, run.err) == (0, "")
+    assert (run.code, run.unexpected) == (0, "")
     assert network.calls == [("tiny", {"depth_kind": None})]
     for text in ("inverse", "12 of 80 x 60", f"splatseed info {room} --depth {tmp_path / 'd'}"):
         assert text in run.out
@@ -60,7 +60,7 @@ def test_a_network(room, network, tmp_path, splatseed):
     network.blind = True
     run = splatseed(*words, "--overwrite")
     assert run.code == 0
-    assert "view_000.png" in run.out  # named, as its map is flat
+    assert "view_000.png" in run.err  # named, as its map is flat
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +92,7 @@ def stereo(maps, monkeypatch):
 def test_a_plain_folder(room, tmp_path, splatseed, stereo):
     out, words = tmp_path / "maps", ("depth", room, "-o", tmp_path / "maps")
     run = splatseed(*words)
-    assert (run.code, run.err) == (0, "")
+    assert (run.code, run.unexpected) == (0, "")
     assert "48 x 36" in run.out
     assert f"--method depth --depth {out}" in run.out
     depths, known = find_depths(load_scene(room), out), stereo.maps[3]
@@ -115,7 +115,7 @@ def test_a_distorted_capture_becomes_a_cloud_on_its_surfaces(bent, capture, tmp_
     """From its own stereo to COLMAP's fusion."""
     out = tmp_path / "dense"
     run = splatseed("depth", bent, "--colmap", "-o", out)
-    assert (run.code, run.err) == (0, "")
+    assert (run.code, run.unexpected) == (0, "")
     assert f"splatseed info {out} --depth {out}" in run.out
     assert splatseed("info", out, "--depth", out).code == 0
     if shutil.which("colmap") is None:
@@ -130,7 +130,7 @@ def test_a_distorted_capture_becomes_a_cloud_on_its_surfaces(bent, capture, tmp_
 @pytest.mark.usefixtures("stereo")
 def test_a_plain_folder_of_a_distorted_capture_suggests_a_workspace(bent, tmp_path, splatseed):
     run = splatseed("depth", bent, "-o", tmp_path / "maps")
-    assert "--colmap" in run.out
+    assert "--colmap" in run.err
     assert "--method depth" not in run.out
 
 

@@ -61,9 +61,10 @@ def test_a_ply_of_another_trainer_is_scored(model, room, splatseed, tmp_path, mo
         assert image.name in run.out
         assert (out / image.name).is_file()
     weights = ("LPIPS was not computed", "https://", str(tmp_path / "hub"), "--lpips-weights")
-    assert all(said in run.out for said in ("mean", *weights)), run.out
-    assert run.err == ""
-    assert "does not record on which photographs it was trained" in run.out
+    assert all(said in run.err for said in weights), run.err
+    assert "mean" in run.out
+    assert run.unexpected == ""
+    assert "does not record on which photographs it was trained" in run.err
 
 
 @pytest.mark.parametrize("evaluated", [True, False])

@@ -51,8 +51,8 @@ def test_a_run_is_exported_cropped_cleaned_and_can_be_scored(model, splatseed, t
     kept = read_gaussians(out)
     assert 70 < len(kept) < 130
     assert kept.means[:, 2].min() > -0.01
-    assert "upside down" in splatseed("export", out, "-o", tmp_path / "again.ply").out
-    assert "upside down" not in splatseed("export", out, "-o", tmp_path / "again.spz").out
+    assert "upside down" in splatseed("export", out, "-o", tmp_path / "again.ply").err
+    assert "upside down" not in splatseed("export", out, "-o", tmp_path / "again.spz").err
 
 
 def test_gaussians_left_out_are_noted_once(model, splatseed, tmp_path):
@@ -62,7 +62,7 @@ def test_gaussians_left_out_are_noted_once(model, splatseed, tmp_path):
     write_gaussians(tmp_path / "broken.ply", replace(whole, scales=scales, means=means))
     run = splatseed("export", tmp_path / "broken.ply", "-o", tmp_path / "out.spz")
     assert run.code == 0, run
-    said = " ".join(run.out.split())
+    said = " ".join(run.err.split())
     assert said.count("no usable size") == 1
     assert said.count("1 Gaussian of 399 ") == 1
     assert len(read_gaussians(tmp_path / "out.spz")) == 398

@@ -107,12 +107,12 @@ def test_nothing_is_to_be_trained_without_its_photographs(kept, own_room, tmp_pa
     for words in (("info", own_room), ("upsample", own_room, "-o", tmp_path / "out")):
         run = splatseed(*words)
         assert run.code == 0, run.err
-        assert missing[kept] in run.out
+        assert missing[kept] in run.out + run.err
         assert "splatseed train" not in run.out
         assert "gsplat" not in run.out
     if kept == "no folder":  # so that there is nothing to look at
-        assert "-> mls" in run.out
-        assert "Without photographs" in run.out
+        assert "-> mls" in run.err
+        assert "Without photographs" in run.err
     advised = lines_of(splatseed("info", own_room).out)
     assert [words[0] for words in advised] == ["upsample"]
 
@@ -121,7 +121,7 @@ def test_a_cloud_alone_is_advised(room, tmp_path, monkeypatch, splatseed):
     monkeypatch.chdir(tmp_path)
     cloud = shutil.copy(room / "sparse" / "0" / "points3D.ply", tmp_path)
     advised = splatseed("info", cloud)
-    assert "Points alone cannot be trained" in advised.out
+    assert "Points alone cannot be trained" in advised.err
     assert follow(advised.out, splatseed) == ["upsample"]
 
 
@@ -133,11 +133,11 @@ def test_graphdecos_trainer_ignores_principal_points(off, told, room, capsys):
     lens = dataclasses.replace(lens, params=(fx, fy, cx, cy - off))
     images = tuple(dataclasses.replace(each, intrinsics=lens) for each in scene.images)
     print_training(room, scene.replace(images=images), Path("out"), "colmap")
-    said = capsys.readouterr().out
-    assert "graphdeco" in said
-    assert (f"ignores principal points, which are up to {off} px off" in said) == told
+    said = capsys.readouterr()
+    assert "graphdeco" in said.out
+    assert (f"ignores principal points, which are up to {off} px off" in said.err) == told
     print_training(room, scene.replace(images=images), Path("out"), "transforms")
-    assert "ignores" not in capsys.readouterr().out  # that trainer does not read it
+    assert "ignores" not in capsys.readouterr().err  # that trainer does not read it
 
 
 def test_only_trainers_that_undistort_are_named_for_a_distorted_scene(bent, tmp_path, splatseed):
@@ -146,7 +146,7 @@ def test_only_trainers_that_undistort_are_named_for_a_distorted_scene(bent, tmp_
     named = [line.split()[0] for line in after.splitlines() if line.startswith("  ")]
     assert named == ["gsplat", "nerfstudio", "Brush", "OpenSplat", "LichtFeld", "Spirula"]
     assert "--undistort" in after.partition("LichtFeld")[2].partition("\n")[0]
-    assert f"splatseed undistort {bent} -o {bent}_undistorted" in after
+    assert f"splatseed undistort {bent} -o {bent}_undistorted" in run.err
 
 
 @pytest.mark.parametrize(

@@ -24,20 +24,20 @@ from splatseed.io import load_scene
 def test_colmap_scenes_are_described_and_upsampled(name, method, scenes, tmp_path, splatseed):
     path, out = scenes / name, tmp_path / "out"
     run = splatseed("info", path)
-    assert (run.code, run.err) == (0, "")
+    assert (run.code, run.unexpected) == (0, "")
     before = load_scene(path)
     total = len(before.points) + before.left_out.duplicates + before.left_out.non_finite
     assert f"{total:,}" in run.out
     assert "nan" not in run.out
     run = splatseed("upsample", path, "--method", method, "--ratio", 2, "-o", out)
-    assert (run.code, run.err) == (0, "")
+    assert (run.code, run.unexpected) == (0, "")
     after, model = load_scene(out), pycolmap.Reconstruction(out / "sparse/0")
     assert model.num_points3D() == len(after.points)
     assert model.num_images() == len(before.images)
     assert ("train it with" in run.out) == bool(before.images)
     # Duplicates of the input are left out, and told of.
     assert 1.9 * len(before.points) < len(after.points) <= 2 * len(before.points)
-    assert ("repeat the position" in run.out) == ("left out" in run.out)
+    assert ("repeat the position" in run.err) == ("left out" in run.err)
     assert re.search(rf"points in +{total:,}\n", run.out)
 
 

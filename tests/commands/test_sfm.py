@@ -48,31 +48,25 @@ def called(monkeypatch, tmp_path):
 def test_words_reach_the_reconstruction_and_its_report_the_user(called, tmp_path, splatseed):
     words = ["--matcher", "sequential", "--threads", 2, "--overwrite", "--seed", 3, "--resume"]
     run = splatseed("sfm", tmp_path, "-o", tmp_path / "out", "--no-shared-camera", *words)
-    assert (run.code, run.err) == (0, "")
+    assert (run.code, run.unexpected) == (0, "")
     settings = Settings("sequential", seed=3, threads=2)
     assert called["args"] == (tmp_path, tmp_path / "out", settings)
     assert not called["shared_camera"]
     assert called["overwrite"]
     assert called["resume"]
-    for text in (
-        "77 of 190",
-        "13 of 20",
-        "1,234",
-        "mean 5.50 images",
-        "mean 0.610 px",
-        "and 2 more",
-    ):
+    for text in ("77 of 190", "13 of 20", "1,234", "mean 5.50 images", "mean 0.610 px"):
         assert text in run.out
+    assert "and 2 more" in run.err
     assert f"splatseed info {tmp_path / 'out'}" in run.out
 
 
 @pytest.mark.parametrize("exact", [True, False])
 def test_poses_that_photographs_do_not_fit_are_pointed_out(exact, called, tmp_path, splatseed):
     called["error"] = PoseErrorEstimate(0.2 if exact else 2.2, 0.17, exact, 757)
-    out = splatseed("sfm", tmp_path, "-o", tmp_path / "out").out
+    _, out, err = splatseed("sfm", tmp_path, "-o", tmp_path / "out")
     verdict = "0.2 px (0.17 degrees) at 757 px a side: exact, at most 0.5 px"
     assert (verdict if exact else "2.2 px (0.17 degrees) at 757 px a side: above 0.5 px") in out
-    assert ("do not fit these poses" in out) != exact
+    assert ("do not fit these poses" in err) != exact
 
 
 def test_poses_are_measured_by_the_photographs(room_of):
@@ -88,8 +82,8 @@ def test_the_photographs_are_counted_by_folder(called, tmp_path, splatseed, caps
         ["scene/a.png", "run/b.png", "scene/c.png"], {"of grey": ["run/d.png"]}, "1 camera"
     )
     told = capsys.readouterr()
-    assert told.err == f"3 photographs in {tmp_path}: 2 in scene, 1 in run\n1 camera\n"
-    assert told.out == "note: Left out: 1 image of grey (run/d.png).\n"
+    photographs = f"3 photographs in {tmp_path}: 2 in scene, 1 in run\n1 camera\n"
+    assert told.err == f"{photographs}note: Left out: 1 image of grey (run/d.png).\n"
 
 
 def test_an_apps_export_gives_its_photographs_and_its_poses_are_pointed_out(
@@ -111,17 +105,17 @@ def test_an_apps_export_gives_its_photographs_and_its_poses_are_pointed_out(
         assert len(photos) == 12
         called["on_photos"](list(photos), left_out, "")
         told = capsys.readouterr()
-        assert told.out.count("Left out") == (export == scanner)
+        assert told.err.count("Left out") == (export == scanner)
         assert (
             f"{export} has poses of 12 photographs, and depth maps: splatseed upsample {export} "
-            in told.out
+            in told.err
         )
         assert f"12 photographs in {photographs}\n" in told.err
     left_out = find_photos(scanner)[1]
     assert [len(names) for names in left_out.values()] == [12, 12, 2]
     splatseed("sfm", room / "images", "-o", tmp_path / "out")
     called["on_photos"](["view_000.png"], {}, "")
-    assert "upsample" not in capsys.readouterr().out
+    assert "upsample" not in capsys.readouterr().err
 
 
 def test_known_poses_are_triangulated_and_refined_when_asked(
@@ -133,9 +127,9 @@ def test_known_poses_are_triangulated_and_refined_when_asked(
     assert "camera_model" not in called
     names = [image.name for image in called["poses_from"].images]
     called["on_photos"](names[2:], {"of an unsupported format": [names[1]]}, "")
-    assert f"; 1 pose without a photograph ({names[0]})." in capsys.readouterr().out
-    moved = splatseed(*words, "--refine-poses").out
+    assert f"; 1 pose without a photograph ({names[0]})." in capsys.readouterr().err
+    _, moved, err = splatseed(*words, "--refine-poses")
     for text in ("9.440 px", "0.160 px", "0.04 units", "0.113", "1.24 degrees", "3.66"):
         assert text in moved
-    assert "stay as given: fewer than 10 points are seen in a.jpg." in moved
+    assert "stay as given: fewer than 10 points are seen in a.jpg." in err
     assert "kept as given" in splatseed(*words, "--refine-poses").out

@@ -118,9 +118,9 @@ def test_refined_poses_are_what_is_trained_scored_and_shown(
     room, bare, refining, splatseed, tmp_path
 ):
     run = splatseed("train", bare, *SHORT, "--refine-poses", "-o", tmp_path / "run")
-    assert (run.code, run.err) == (0, "")
-    assert re.search(r"9\.00 .* 0\.50 px", run.out)
-    assert "points of the scene and" in run.out  # triangulated points and auto's
+    assert (run.code, run.unexpected) == (0, "")
+    assert re.search(r"9\.00 .* 0\.50 px", run.err)
+    assert "points of the scene and" in run.err  # triangulated points and auto's
     config = json.loads((tmp_path / "run/config.json").read_text())
     assert (config["scene"], config["refine_poses"]) == (str(bare), True)
     assert config["seeds"]["count"] > 1.2 * len(load_scene(room).points)
@@ -166,7 +166,7 @@ def test_a_resumed_run_keeps_its_poses_and_photographs(
     write_scene(fewer, tmp_path / "fewer", require_points=False)
     refused(str(tmp_path / "fewer"), tmp_path / "fewer", "--resume", "-o", run)
     resumed = splatseed("train", bare, "--resume", "-o", run)
-    assert (resumed.code, resumed.err) == (0, "")
+    assert (resumed.code, resumed.unexpected) == (0, "")
     assert len(refining) == 1
     assert _gaussians(run) == finished
     _unfinish(run)
@@ -203,14 +203,14 @@ def test_points_stay_where_refinement_gains_nothing(room, refinement_of_room, sp
     note = str(finding)
     assert same is own
     words = ("--method", "linear", "--ratio", "2", "-o")
-    out = splatseed("upsample", room, "--refine-poses", *words, tmp_path / "seeds").out
+    out = splatseed("upsample", room, "--refine-poses", *words, tmp_path / "seeds").err
     assert "Poses and points stay as given" in note
     assert note in out
     seeds = load_scene(tmp_path / "seeds")
     np.testing.assert_array_equal(seeds.points.xyz[: len(scene.points)], scene.points.xyz)
     assert len(seeds.tracks) == len(scene.tracks)
     run, plain = tmp_path / "run", tmp_path / "plain"
-    assert note in splatseed("train", room, *SHORT, "--refine-poses", "-o", run).out
+    assert note in splatseed("train", room, *SHORT, "--refine-poses", "-o", run).err
     finished = _gaussians(run)
     _unfinish(run)
     assert splatseed("train", room, "--resume", "-o", run).code == 0
@@ -224,10 +224,10 @@ def test_points_that_refinement_replaces_are_announced_first(
     refinement_of_room(kept=False)
     number = len(load_scene(room).points)
     out = splatseed("upsample", room, "--refine-poses", "--method", "linear", "--ratio", "2",
-                    "-o", tmp_path / "seeds").out  # fmt: skip
+                    "-o", tmp_path / "seeds").err  # fmt: skip
     assert f"100 points, triangulated in place of the scene's {number:,}" in out.split("->")[0]
     assert len(load_scene(tmp_path / "seeds").points) == 200
-    out = splatseed("train", room, *SHORT, "--refine-poses", "-o", tmp_path / "run").out
+    out = splatseed("train", room, *SHORT, "--refine-poses", "-o", tmp_path / "run").err
     told = f"The scene's {number:,} points are replaced by 100 triangulated"
     assert told in out.split("->")[0]
 

@@ -65,7 +65,7 @@ def test_a_distorted_scene_becomes_one_of_pinholes(distorted, tmp_path, splatsee
     assert run.code == 0, run
     assert f"splatseed upsample {out}" in run.out
     assert f"Its 12 depth maps are not in the output: name them to upsample by --depth {path}" in (
-        run.out
+        run.err
     )
     after = load_scene(out)
     assert {lens.model for lens in after.intrinsics} == {"PINHOLE"}
@@ -136,7 +136,7 @@ def test_a_scene_that_lacks_something_is_refused(distorted, tmp_path, splatseed)
     path = write_scene(load_scene(distorted), tmp_path / "own", copy_images=True).path
     (path / "images/view_003.png").unlink()
     run = splatseed("undistort", path, "-o", tmp_path / "some")
-    assert (run.code, run.out.count("1 of 12 images is missing")) == (0, 1), run
+    assert (run.code, run.err.count("1 of 12 images is missing")) == (0, 1), run
     some, whole = load_scene(tmp_path / "some"), load_scene(path)
     assert {image.name for image in some.images} == {
         f"view_{i:03}.png" for i in range(12) if i != 3

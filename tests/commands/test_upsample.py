@@ -7,7 +7,7 @@ import json
 import re
 import shlex
 import shutil
-from contextlib import redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout
 from importlib.metadata import EntryPoint
 from io import StringIO
 from pathlib import Path
@@ -67,7 +67,7 @@ def test_every_method_writes_a_scene_that_opens(method, room, tmp_path, splatsee
     out = tmp_path / "out"
     maps = ["--depth", room] if method == "depth" else []
     run = splatseed("upsample", room, "--method", method, *maps, "--ratio", 3, "-o", out)
-    assert (run.code, run.err) == (0, "")
+    assert (run.code, run.unexpected) == (0, "")
     before, after = load_scene(room), load_scene(out)
     count = len(before.points)
     assert len(after.points) == 3 * count
@@ -85,7 +85,7 @@ def test_every_method_writes_a_scene_that_opens(method, room, tmp_path, splatsee
 def seeded(room, tmp_path_factory):
     """The room with the points of the default, and what was said."""
     out = tmp_path_factory.mktemp("seeded") / "my scene"
-    with redirect_stdout(StringIO()) as said:
+    with redirect_stdout(StringIO()) as said, redirect_stderr(said):
         assert exit_code("upsample", room, "--budget", 1200, "-o", out) == 0
     return out, said.getvalue()
 
@@ -120,7 +120,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(
     for seed in (0, 6):
         words = ("--budget", 1200, "--seed", seed, "-o", tmp_path / str(seed))
         run = splatseed("upsample", room, *words)
-        assert (run.code, run.err) == (0, "")
+        assert (run.code, run.unexpected) == (0, "")
     assert _bytes(tmp_path / "0") == _bytes(seeded[0])
     assert _manifest(tmp_path / "0") == _manifest(seeded[0])
     assert _bytes(tmp_path / "6") != _bytes(seeded[0])
@@ -153,7 +153,7 @@ def test_a_bare_ply_where_new_points_coincide(tmp_path, splatseed):
     told = re.search(r"points out +([\d,]+) \(([\d,]+) original, ([\d,]+) linear\)", run.out)
     total, *parts = (int(number.replace(",", "")) for number in told.groups())
     assert total == sum(parts) == len(read_ply(tmp_path / "out/sparse/0/points3D.ply"))
-    assert "no images" in run.out
+    assert "no images" in run.err
     assert "train it with" not in run.out
     with PilImage.open(tmp_path / "out/preview.png") as picture:
         colored = np.ptp(np.asarray(picture.convert("RGB")).astype(int), axis=2) > 20
@@ -178,7 +178,7 @@ def test_transforms_in_transforms_out(room, tmp_path, splatseed):
     run = splatseed("upsample", first, "-o", tmp_path / "third", "--method", "mls")
     assert run.code == 0, run.err
     assert not (tmp_path / "third/sparse").exists()
-    command = run.out.partition("written by: ")[2].splitlines()[0]
+    command = run.err.partition("written by: ")[2].splitlines()[0]
     run = splatseed(*shlex.split(command)[1:])
     assert run.code == 0, run.err
     assert pycolmap.Reconstruction(tmp_path / "third-colmap/sparse/0").num_images() == 12
@@ -243,8 +243,8 @@ def test_depth_maps_show_where_to_look(rgbd, tmp_path, splatseed):
 def test_photographs_without_points_are_seeded_and_drawn(bare, tmp_path, splatseed):
     out = tmp_path / "out"
     run = splatseed("upsample", bare, "--preview", "-o", out)
-    assert (run.code, run.err) == (0, "")
-    assert "-> auto: no points" in run.out
+    assert (run.code, run.unexpected) == (0, "")
+    assert "-> auto: no points" in run.err
     seeds = load_scene(out).points
     assert len(seeds) > 500
     assert not seeds.num_original
@@ -277,14 +277,14 @@ def own_method(tmp_path, monkeypatch):
     (tmp_path / "package" / f"{value.partition(':')[0]}.py").write_text(code)
     monkeypatch.syspath_prepend(tmp_path / "package")
     monkeypatch.setitem(METHODS._plugins, name, EntryPoint(name, value, GROUP))
-    (command,) = re.findall(r"^splatseed upsample SCENE (.*) -o OUT$", own, re.MULTILINE)
+    *_, command = re.findall(r"^splatseed upsample SCENE (.*) -o OUT$", own, re.MULTILINE)
     return name, command.split()
 
 
 def test_a_method_of_ones_own_is_named_as_the_origin(own_method, room, tmp_path, splatseed):
     name, words = own_method
     run = splatseed("upsample", room, *words, "-o", tmp_path / "out")
-    assert (run.code, run.err) == (0, "")
+    assert (run.code, run.unexpected) == (0, "")
     new = 3 * len(load_scene(room).points)
     assert f" original, {new:,} {name})" in run.out
     assert re.search(
@@ -309,7 +309,7 @@ def test_the_maps_are_named_and_noted_or_the_scenes_own(room, surfaces, tmp_path
     ):
         words = ("--method", "depth", *maps, "--ratio", 2, "-o", out)
         run = splatseed("upsample", scene, *words)
-        assert (run.code, run.err) == (0, "")
+        assert (run.code, run.unexpected) == (0, "")
         np.testing.assert_array_equal(load_scene(out).points.xyz, load_scene(own).points.xyz)
     told = _manifest(named)
     assert told["depth"] == str((room / "depths").resolve())
@@ -318,22 +318,22 @@ def test_the_maps_are_named_and_noted_or_the_scenes_own(room, surfaces, tmp_path
     assert np.median(surfaces.distance(points.xyz[points.source != 0].astype(float))) < 0.01
     maps = "Its 12 depth maps are not used by linear: method depth aligns them"
     words = ("--method", "linear", "-o")
-    assert maps in splatseed("upsample", room, *words, tmp_path / "lines").out
+    assert maps in splatseed("upsample", room, *words, tmp_path / "lines").err
     bare = write_scene(load_scene(room), tmp_path / "bare").path
     (bare / "depths").unlink()
-    assert "depth maps" not in splatseed("upsample", bare, *words, tmp_path / "bare_lines").out
+    assert "depth maps" not in splatseed("upsample", bare, *words, tmp_path / "bare_lines").err
     run = splatseed("upsample", bare, "--method", "depth", "-o", tmp_path / "none")
-    assert (run.code, run.err.count("\n")) == (2, 1)
-    assert "--depth" in run.err
+    assert (run.code, run.unexpected.count("\n")) == (2, 1)
+    assert "--depth" in run.unexpected
 
 
 def test_a_capture_has_its_own_maps_and_needs_no_points(rgbd, surfaces, tmp_path, splatseed):
     out, lift = tmp_path / "out", ("--method", "depth", "--depth.no-align", "--num-points")
     run = splatseed("upsample", rgbd, *lift[:2], "-o", tmp_path / "plain")
-    assert (run.code, run.err) == (0, "")
-    assert f"{round(0.25 * 96 * 72):,} points" in run.out
+    assert (run.code, run.unexpected) == (0, "")
+    assert f"{round(0.25 * 96 * 72):,} points" in run.err
     run = splatseed("upsample", rgbd, *lift[:2], "--num-points", 700, "-o", out)
-    assert (run.code, run.err) == (0, "")
+    assert (run.code, run.unexpected) == (0, "")
     assert "far from any original" not in run.out
     scene = load_scene(out)
     assert (len(scene.points), len(scene.images)) == (700, 12)
@@ -342,7 +342,7 @@ def test_a_capture_has_its_own_maps_and_needs_no_points(rgbd, surfaces, tmp_path
     maps = ("--depth", rgbd / "results", "--depth-scale", 5000)
     run = splatseed("upsample", out, *lift, 9, *maps, "-o", tmp_path / "again")
     assert run.code == 0, run.err
-    assert "700 points" in run.out
+    assert "700 points" in run.err
     assert len(load_scene(tmp_path / "again").points) == 9
     mls, none = ("upsample", out, "--method", "mls"), "700"
     for words, says in (
@@ -364,8 +364,8 @@ def test_images_without_usable_depth_are_noted(own_room, tmp_path, splatseed):
     words = ("--method", "depth", "--depth", own_room, "--ratio", 1.5, "-o", tmp_path / "out")
     run = splatseed("upsample", own_room, *words)
     assert run.code == 0
-    assert "3 of 12 images" in run.out
-    assert f"({maps[5].name}: " in run.out
+    assert "3 of 12 images" in run.err
+    assert f"({maps[5].name}: " in run.err
 
 
 # Clouds -------------------------------------------------------------------------------------------
@@ -399,8 +399,8 @@ def test_a_scan_in_the_scenes_frame(splatseed, room, scan, tmp_path):
     assert len(seeds) == 1500
     assert CLOUD in seeds.source
     assert "cloud)" in run.out
-    assert "120,000 points were read" in run.err + run.out
-    assert re.search(r"voxels, 4\.\d GB of memory", run.out)
+    assert "120,000 points were read" in run.err
+    assert re.search(r"voxels, 4\.\d GB of memory", run.err)
     told = json.loads((out / "splatseed.json").read_text())
     assert told["method"] == "cloud"
     assert len(told["cloud"]["files"]) == 2
@@ -516,7 +516,7 @@ def test_a_cloud_beside_cover(method, splatseed, room, tmp_path):
     words = ("--cloud", tmp_path / "part.ply", "--method", method, "-o", tmp_path / "out")
     run = splatseed("upsample", room, *words)
     assert run.code == 0, run.err
-    assert "The cloud covers" in run.out
-    assert ("seeds the rest" in run.out) == (method == "cloud")
+    assert "The cloud covers" in run.err
+    assert ("seeds the rest" in run.err) == (method == "cloud")
     found = set(load_scene(tmp_path / "out").points.source)
     assert (SOURCE_CODES["cover"] in found) == (method == "cover")

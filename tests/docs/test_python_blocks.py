@@ -21,7 +21,7 @@ def folder(room_of, tmp_path, monkeypatch):
     """The working directory, with a small scene under every name that the pages use."""
     monkeypatch.chdir(tmp_path)
     for name in NAMES:
-        shutil.copytree(room_of(9, 64, 48).path, tmp_path / name)
+        shutil.copytree(room_of(12, 64, 48).path, tmp_path / name)
     return tmp_path
 
 

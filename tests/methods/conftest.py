@@ -16,7 +16,8 @@ from .references import Cloud
 @pytest.fixture
 def third_party(monkeypatch):
     """Installs a package that registers the method "copies", and one that wants to be "mls"."""
-    found = [SimpleNamespace(name=name, load=lambda: Copies) for name in ("copies", "mls")]
+    entry = {"value": "copies:Copies", "dist": None, "load": lambda: Copies}
+    found = [SimpleNamespace(name=name, **entry) for name in ("copies", "mls")]
     monkeypatch.setattr(
         "splatseed.methods.registry.entry_points", lambda *, group: found if group else []
     )

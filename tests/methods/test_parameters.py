@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from importlib.metadata import EntryPoint
 
 import numpy as np
@@ -12,6 +13,7 @@ from splatseed import METHODS
 from splatseed.errors import (
     MissingDependencyError,
     ParameterError,
+    PluginError,
     PointCloudError,
     UnknownNameError,
 )
@@ -120,6 +122,47 @@ def test_a_method_that_is_not_installed_or_broken_is_explained(monkeypatch):
         ss.upsample(ss.PointCloud(np.zeros((1, 3)), np.zeros((1, 3), np.uint8)), "copies")
 
 
+def test_a_method_is_known_by_its_place_in_a_file(wavy, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "helper.py").write_text("SHIFT = 1.0")
+    file = tmp_path / "mls.py"
+    code = """
+from __future__ import annotations
+from dataclasses import dataclass
+from helper import SHIFT
+
+@dataclass(frozen=True)
+class Shifted:
+    by: float = {by}
+
+    def __call__(self, scene, num_new, rng, progress):
+        return scene.points.xyz[:num_new] + self.by * SHIFT, scene.points.rgb[:num_new]
+
+mls = Shifted(2.0)
+
+def stereo(scene, num_new, rng, progress):
+    return Shifted(3.0)(scene, num_new, rng, progress)
+"""
+    file.write_text(code.format(by=1.0))
+    for name, parameters, by in (
+        ("Shifted", {}, 1), ("Shifted", {"by": 4.0}, 4), ("mls", {}, 2), ("stereo", {}, 3)
+    ):  # fmt: skip
+        seeds = ss.upsample(wavy, f"{file}:{name}", num_points=170, **parameters)
+        np.testing.assert_allclose(seeds.xyz[160:], wavy.xyz[:10] + by, rtol=1e-6)
+        assert set(seeds.source[160:]) == {255}
+    given = ss.upsample(wavy, METHODS[f"{file}:stereo"](), num_points=170)
+    assert set(given.source[160:]) == {255}
+    file.write_text(code.format(by=5.0))  # as in a notebook, between two calls
+    seeds = ss.upsample(wavy, f"{file}:Shifted", num_points=170)
+    np.testing.assert_allclose(seeds.xyz[160:], wavy.xyz[:10] + 5, rtol=1e-6)
+    with pytest.raises(ParameterError, match=r"a parameter of .*it has none"):
+        ss.upsample(wavy, f"{file}:stereo", k=3)
+    for name, found in (("mls.py:none", "no attribute"), ("none.py:mls", "FileNotFound"),
+                        ("mls.py:SHIFT", "cannot be called")):  # fmt: skip
+        with pytest.raises(MissingDependencyError, match=found):
+            METHODS[f"{tmp_path / name}"]
+
+
 class Changing(Copies):
     """A third party's method that knows more of its points, or gets them wrong."""
 
@@ -159,9 +202,18 @@ def test_a_method_may_report_findings_and_know_the_budget(wavy):
     ("change", "says"),
     [
         (lambda new: new.replace(xyz=np.full((4, 3), np.nan)), "at new point 0"),
-        (lambda new: new.select(slice(3)), "expected 4 new points; found 3"),
+        (lambda new: new.select(slice(3)), r"4 new points.*'Changing'; found a PointCloud of 3\."),
+        (lambda new: new.with_added(np.zeros((160, 3)), np.zeros((160, 3), np.uint8)),
+         r"found a PointCloud of 164\. Return the new points only"),
+        (lambda _: None, r"'Changing'; found None\."),
+        (lambda new: new.xyz, r"found float32 \[4, 3\]\."),
+        (lambda new: (new.xyz, new.rgb / 255), r"float32 \[4, 3\], float64 \[4, 3\]\. Correct"),
+        (lambda new: (new.xyz[:3], new.rgb), r"tuple of float32 \[3, 3\], uint8 \[4, 3\]\."),
+        (lambda new: new.replace(xyz=new.xyz[:3], rgb=new.rgb[:3]),
+         r"of shape \[3\], in method 'Changing', line \d+ of .*test_parameters\.py; found \[4\]"),
+        (lambda new: new.missing, r"'Changing' without an exception; found Attribute.*line \d+"),
     ],
-)
+)  # fmt: skip
 def test_a_third_partys_bad_points_are_refused(change, says, wavy):
-    with pytest.raises(PointCloudError, match=says):
+    with pytest.raises((PointCloudError, PluginError), match=says):
         ss.upsample(wavy, Changing(change), num_points=len(wavy) + 4)

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from splatseed.sfm.cameras import Exif, Photo, describe_cameras, read_exif, share_cameras
+from splatseed.sfm.cameras import (
+    Exif,
+    Photo,
+    default_model,
+    describe_cameras,
+    read_exif,
+    share_cameras,
+)
 
 SIZE = (4000, 3000)
 
@@ -90,3 +97,8 @@ def test_exif_is_read_and_what_is_none_of_it_left(tmp_path):
     (tmp_path / "b.jpg").write_bytes(broken[: at + 8] + b"\xff" * 30 + broken[at + 38 :])
     with Image.open(tmp_path / "b.jpg") as image:
         assert read_exif(image) == Exif()
+
+
+def test_distortion_is_estimated_of_many_photographs_only():
+    assert [default_model(count) for count in (2, 15)] == ["SIMPLE_PINHOLE"] * 2
+    assert [default_model(count) for count in (16, 300)] == ["OPENCV"] * 2

@@ -89,6 +89,31 @@ def test_reconstruct_finds_the_cameras(posed, photos, tmp_path):
     assert manifest["report"]["registered"] == 6
 
 
+@pytest.mark.parametrize("has_exif", [True, False])
+@pytest.mark.usefixtures("pycolmap_here")
+def test_few_photographs_get_a_lens_without_distortion(posed, photos, tmp_path, has_exif):
+    """With EXIF of 26 mm, which is 5% off, the focal length is its; else it is estimated."""
+    few = tmp_path / "few"
+    few.mkdir()
+    for image in posed.images[:5]:
+        picture, exif = PilImage.open(photos / image.name), PilImage.Exif()
+        if has_exif:
+            exif.get_ifd(0x8769)[0xA405] = 26  # FocalLengthIn35mmFilm
+        picture.save(few / PurePosixPath(image.name).with_suffix(".jpg"), exif=exif, quality=98)
+    report = reconstruct(few, tmp_path / "scene")
+    assert report.registered == 5
+    (found,) = report.findings
+    assert (found.kind, "EXIF" in found.text) == ("held-lens", has_exif)
+    lens = load_scene(report.path).images[0].intrinsics
+    assert (lens.model, lens.width, lens.height) == ("SIMPLE_PINHOLE", 256, 192)  # nothing was cut
+    guess = pycolmap.infer_camera_from_image(few / "view_000.jpg")
+    assert guess.has_prior_focal_length is has_exif
+    true = posed.images[0].K[0, 0]
+    assert lens.pinhole.params[0] == (
+        guess.focal_length if has_exif else pytest.approx(true, rel=0.03)
+    )
+
+
 @pytest.mark.usefixtures("pycolmap_here")
 def test_known_poses_are_kept_and_surfaces_found(capture, posed, photos, tmp_path):
     known = posed.replace(images=posed.images[1:])  # the first photograph has no pose

@@ -35,14 +35,14 @@ def _json(path):
 
 def test_trains_by_the_best_strategy_and_says_what_and_where(room_path, tmp_path, capsys):
     run = tmp_path / "run"
-    words = (room_path, "--max-steps", "3", "--long-side", "48", "-o", run)
+    words = (room_path, "--max-steps", "3", "--long-side", "48", "--test-every", "8", "-o", run)
     assert _run(*words) == 0
     said = capsys.readouterr()
     size = "rho of 48 x 36 pixels"
-    for words_said in ("-> strategy grow (auto),", f"At most {48 * 36:,} Gaussians: 1{size}",
-                       "test PSNR", f"splatseed view {run}"):  # fmt: skip
+    for words_said in ("-> strategy grow (auto),", f"At most {48 * 36:,} Gaussians: 1{size}"):
+        assert words_said in said.err
+    for words_said in ("test PSNR", f"splatseed view {run}"):
         assert words_said in said.out
-    assert not said.err
     config, metrics = _json(run / "config.json"), _json(run / "metrics.json")
     assert (config["strategy"], config["cap_max"]) == ("auto", 48 * 36)
     assert config["seeding"] == "advised"
@@ -58,7 +58,7 @@ def test_trains_by_the_best_strategy_and_says_what_and_where(room_path, tmp_path
         assert _run(*words, "--strategy", strategy, *budget, "--overwrite") == 0
         config = _json(run / "config.json")
         assert (config["strategy"], config["cap_max"]) == (strategy, cap)
-        assert (f"{cap} Gaussians: 0.25{size}" in capsys.readouterr().out) == bool(budget)
+        assert (f"{cap} Gaussians: 0.25{size}" in capsys.readouterr().err) == bool(budget)
     # Where nothing is named, a run goes on as it began.
     asked = TrainSettings()
     again = replace(asked, max_steps=3, data_factor=2)
@@ -159,9 +159,9 @@ def test_large_photographs_are_smaller_by_default_and_stay_so(
             patch.setattr(f"splatseed.{module}.TRAINED_SIDE", 48)
         assert _run(room_path, "--max-steps", "3", "--strategy", "none", "-o", run) == 130
     assert (
-        "96 x 72 pixels are used at 48 x 36, as the default is 48 a side" in capsys.readouterr().out
+        "96 x 72 pixels are used at 48 x 36, as the default is 48 a side" in capsys.readouterr().err
     )
     assert _json(run / "config.json")["data_factor"] == 2
     assert _run(room_path, "-o", run, "--resume") == 0  # with a default that changes nothing
-    assert "48 x 36" in capsys.readouterr().out
+    assert "48 x 36" in capsys.readouterr().err
     assert _run(room_path, "--data-factor", "1", "-o", run, "--resume") == 2

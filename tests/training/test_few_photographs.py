@@ -1,14 +1,28 @@
-"""With few photographs each step drops some Gaussians."""
+"""With few photographs each step drops some Gaussians, and all photographs are trained on."""
 
 from __future__ import annotations
+
+import json
+from functools import partial
 
 import pytest
 import torch
 
+from splatseed.scene import Split
+from splatseed.splat.formats import read_gaussians
+from splatseed.splat.render_loss import RenderLoss
 from splatseed.training import trainer
+from splatseed.training.api import prepare_training
+from splatseed.training.folder import config_of
+from splatseed.training.model_views import find_model_views
 from splatseed.training.parameters import DROPPED, as_parameters, with_dropout
+from splatseed.training.request import TrainRequest
 from splatseed.training.schedule import make_schedule
 from splatseed.training.traits import STRATEGIES
+
+from ..command_line import exit_code
+
+SHORT = {"strategy": "none", "max_steps": 3, "data_factor": 2, "seeding": "scene"}
 
 
 def test_some_are_dropped_and_the_others_make_up_for_them():
@@ -49,3 +63,52 @@ def test_only_runs_with_few_photographs_are_changed(begin, monkeypatch, few, dif
         return run.state.params["means"].detach()
 
     assert torch.equal(trained("plain", 0), trained("few", few)) is not differs
+
+
+@pytest.mark.usefixtures("draw_curves")
+def test_all_of_few_photographs_are_trained_on_and_nothing_is_scored(room_path, tmp_path, capsys):
+    run, train = tmp_path / "run", partial(exit_code, "train", room_path)
+    words = ("--strategy", "none", "--max-steps", "3", "--data-factor", "2", "--seeds", "scene")
+    assert train(*words, "-o", run) == 0
+    said, notes = capsys.readouterr()
+    assert "All 9 photographs are trained on" in notes
+    assert "--test-every 8 holds some out" in notes
+    assert "no photograph was held out" in said
+    assert not any(word in said for word in ("nan", "PSNR", "renders", "test views", "evaluate"))
+    metrics, config = (json.loads((run / f"{n}.json").read_text()) for n in ("metrics", "config"))
+    assert (metrics["psnr"], metrics["ssim"], metrics["per_image"], metrics["tests"]) == (
+        None, None, [], [],
+    )  # fmt: skip
+    assert (config["test_every"], len(config["split"]["train"]), config["split"]["test"]) == (
+        0, 9, [],
+    )  # fmt: skip
+    assert not (run / "renders").exists()
+    assert (run / "curve.png").is_file()
+    assert (run / "curve.csv").read_text().count("\n") == 4  # a header and every step
+
+    assert exit_code("evaluate", run) == 2
+    assert "nothing was held out" in capsys.readouterr().err
+    assert exit_code("evaluate", run, "--test-every", "8") == 0
+    assert "trained on 2 of these 2 views" in " ".join("".join(capsys.readouterr()).split())
+
+    path = run / "point_cloud.ply"
+    views = find_model_views(path, read_gaussians(path), room_path, config_of(run))
+    assert (len(views.train), views.label) == (9, "training view")
+    loss = RenderLoss(3, (30.0, 29.0), (40.0,), views.label).finding(".sog")
+    assert "(3 training views)" in loss.text
+
+
+def test_photographs_are_held_out_where_the_user_or_the_scene_says_so(room, tmp_path):
+    def begun(scene, **options):
+        notes = []
+        request = TrainRequest.of({**SHORT, **options})
+        run = prepare_training(scene, tmp_path / "run", request, note=notes.append)
+        views = [view.name for view in run.trainer.test_views]
+        return views, "nothing-held-out" in {note.kind for note in notes}
+
+    names = sorted(image.name for image in room.images)
+    assert begun(room, test_every=8) == ([names[0], names[8]], False)
+    assert begun(room, test_every=0, overwrite=True) == ([], False)
+    split = Split(frozenset(names[:4]), frozenset(names[4:5]), "list")
+    assert begun(room.replace(listed=split), overwrite=True) == ([names[4]], False)
+    assert begun(room, overwrite=True) == ([], True)

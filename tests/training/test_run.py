@@ -275,7 +275,7 @@ def test_another_split_is_found_out(begin, room, tmp_path):
     resumed.train()
     resumed.finish(evaluate_views)
     found = "The run was trained on 1 of these 2 views: the scene's split was another."
-    for scene, texts in ((room, []), (listed, [listed.listed.sentence, found])):
+    for scene, texts in ((room, []), (listed, [listed.listed.finding(given=False).text, found])):
         evaluation = Evaluation.of(tmp_path / "run", scene)
         assert [each.text for each in evaluation.findings(evaluation.load())] == texts
     findings = []

@@ -99,7 +99,7 @@ def test_a_path_shows_its_crop_box_before_its_background(room, run_folder, tmp_p
     (tmp_path / "path.json").write_text(json.dumps(content))
     said = splatseed("flight", run_folder, "--path", tmp_path / "path.json", "-o", tmp_path / "a")
     assert said.code == 0, said.err
-    assert f"of {len(means):,} Gaussians, those in its crop box" in said.out
+    assert f"of {len(means):,} Gaussians, those in its crop box" in said.err
     picture = np.array(Image.open(tmp_path / "a/00001.png"))
     assert picture.shape == (71, 95, 3)  # as asked for, though odd
     empty = (picture == [26, 230, 51]).all(axis=2)

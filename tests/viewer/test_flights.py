@@ -246,7 +246,7 @@ def _frames(path):
 def test_a_flight_is_a_video_of_the_scene(run_folder, tmp_path, splatseed):
     out = tmp_path / "deep/flight.mp4"
     said = splatseed("flight", run_folder, "-o", out, "--seconds", 0.2)
-    assert (said.code, said.err) == (0, "")
+    assert (said.code, said.unexpected) == (0, "")
     frames, fps = _frames(out)
     assert (frames.shape, fps) == ((6, 72, 96, 3), 30)
     assert frames.mean() > 20
@@ -256,8 +256,8 @@ def test_a_flight_is_a_video_of_the_scene(run_folder, tmp_path, splatseed):
 def test_without_cameras_the_video_circles_with_a_note(run_folder, tmp_path, splatseed):
     ply = shutil.copy(run_folder / "point_cloud.ply", tmp_path / "model.ply")
     words = ("flight", ply, "--seconds", 0.05, "--size", "48x32", "-o")
-    assert "circles" in splatseed(*words, tmp_path / "a.mp4").out
-    assert "circles" not in splatseed(*words, tmp_path / "b.mp4", "--path", "orbit").out
+    assert "circles" in splatseed(*words, tmp_path / "a.mp4").err
+    assert "circles" not in splatseed(*words, tmp_path / "b.mp4", "--path", "orbit").err
     assert (_frames(tmp_path / "a.mp4")[0] == _frames(tmp_path / "b.mp4")[0]).all()
 
 
@@ -301,7 +301,7 @@ def test_a_path_through_the_models_own_world_is_moved_with_the_model(
     words = ("flight", tmp_path / "model.ply", "--scene", room, "--path", path, "-o", video)
     said = splatseed(*words)
     assert said.code == 0, said.err
-    assert "--transform none" in said.out
+    assert "--transform none" in said.err
     shown = _frames(video)[0][0] / 255
     assert np.abs(shown - _render(run_folder, image)).mean() < 0.01
 

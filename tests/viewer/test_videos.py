@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import gc
 import subprocess
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="videos need imageio-ffmpeg (extra view)")
 
-from splatseed.viewer.videos import unseen_findings, write_video
+from splatseed.viewer.models import pinhole_view
+from splatseed.viewer.videos import guessed_findings, unseen_findings, write_video
 
 COLOURS = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255], [90, 160, 40]])
 
@@ -52,3 +55,23 @@ def test_frames_without_the_model_are_named():
     (found,) = unseen_findings([0.4, 0.0, 0.9, 0.001], ["a", "b", "c", "d"])
     assert (found.kind, found.subjects) == ("empty-frames", ("b", "d"))
     assert unseen_findings([0.4, 0.03], ["a", "b"]) == []
+
+
+def test_frames_that_leave_few_photographs_are_named():
+    """Cameras of 90 degrees look at a wall 2 units ahead, of which they see 4 units each."""
+
+    def at(x, name):
+        pose = np.eye(4)
+        pose[0, 3] = -x
+        return replace(pinhole_view((200, 200), np.pi / 2, pose), name=name)
+
+    wall = SimpleNamespace(depth=lambda view: np.full((view.height, view.width), 2.0, np.float32))
+    photographs = [at(0.0, "a.jpg"), at(1.0, "b.jpg")]
+    between = [at(x, f"{x}.png") for x in (0.0, 0.4, 1.0)]
+    assert guessed_findings(wall, between, photographs) == []
+    (found,) = guessed_findings(wall, [*between, at(1.1, "c.png"), at(3.0, "d.png")], photographs)
+    assert (found.kind, found.subjects) == ("guessed-frames", ("d.png",))
+    assert "1 of 5 frames" in found.text
+    assert "50% (d.png)" in found.text  # of its 4 units 2 are seen from 1.0
+    assert guessed_findings(wall, [at(3.0, "d.png")], 17 * photographs[:1]) == []
+    assert guessed_findings(wall, [at(3.0, "d.png")], []) == []

@@ -139,8 +139,8 @@ class ComparedArm:
     on some scene. ``gains``, None if unknown in some pair: differences of the scores; ``in_time``,
     PSNR when the baseline ends minus the baseline's final PSNR, in dB; ``steps`` and ``seconds``,
     the mean logarithm of those to the baseline's final PSNR, relative to the baseline's total.
-    ``on_scene``: gain in PSNR by scene in dB, the lowest first. ``reached``: number of pairs in
-    which the arm reaches the baseline's final PSNR.
+    ``on_scene``: gain in PSNR by scene in dB, the lowest first; empty for the baseline.
+    ``reached``: number of pairs in which the arm reaches the baseline's final PSNR.
     """
 
     arm: ArmKey
@@ -148,7 +148,7 @@ class ComparedArm:
     runs: int
     means: Mapping[str, float]
     gains: Mapping[str, Difference | None]
-    on_scene: Mapping[str, float]
+    on_scene: Mapping[str, Difference]
     reached: int
 
     @property
@@ -170,8 +170,8 @@ def baseline_of(study: Study) -> ArmKey | None:
 def compared_arms(study: Study) -> tuple[ComparedArm, ...]:
     """Compare every arm with the baseline; returns them in order of mean gain.
 
-    The p values of each score are adjusted over the arms of a strategy, as those of ``gains``: the
-    same comparison has the same verdict in both.
+    The p values of each score are adjusted over the arms of a strategy, and those on scenes over
+    all of them, as in ``gains``: the same comparison has the same verdict in both.
     """
     base = baseline_of(study)
     if base is None:
@@ -194,12 +194,18 @@ def compared_arms(study: Study) -> tuple[ComparedArm, ...]:
             family = {arm: gain for arm, gain in known.items() if arm.strategy == strategy}
             gained[name] |= _adjusted(family)
     columns = [*SCORES, "gaussians", "seeding", "training"]
+    on_scenes = dict[tuple[ArmKey, str], Difference]()
+    for strategy in study.strategies:
+        places = [(arm, scene) for arm, part in by_arm.items() if arm.strategy == strategy
+                  and arm != base for scene in sorted(set(part["scene"]))]  # fmt: skip
+        on_scenes |= _adjusted({place: mean_gain.on_scene(*place, "psnr") for place in places})
     compared = []
     for arm, part in by_arm.items():
         scenes, reached = tuple(sorted(set(part["scene"]))), int(part["seconds_gain"].count())
         means = dict(part.groupby("scene")[columns].mean().mean(skipna=False))
         of_arm = {name: by_name.get(arm) for name, by_name in gained.items()}
-        on_scene = dict(part.groupby("scene")["psnr_gain"].mean().sort_values(kind="stable"))
+        own = {scene: gain for (of, scene), gain in on_scenes.items() if of == arm}
+        on_scene = dict(sorted(own.items(), key=lambda item: item[1].mean))
         compared.append(ComparedArm(arm, scenes, len(part), means, of_arm, on_scene, reached))
     return tuple(sorted(compared, key=lambda arm: -arm.gain.mean))
 
@@ -244,7 +250,11 @@ class _MeanGains:
             return statistics.over_scenes(means)
         if name in {"steps", "seconds"} or arm == self._base:
             return statistics.over_scenes(column, "repeat")
-        place = arm.strategy, str(means.index[0]), name
+        return self.on_scene(arm, str(means.index[0]), name)
+
+    def on_scene(self, arm: ArmKey, scene: str, name: str) -> Difference | None:
+        """Average one over the pairs of an arm other than the baseline on one scene."""
+        place = arm.strategy, scene, name
         if place not in self._on_scene:
             self._on_scene[place] = self._differences(*place)
         return self._on_scene[place][arm]

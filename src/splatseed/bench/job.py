@@ -28,6 +28,7 @@ import numpy as np
 from splatseed.bench.plan import CLOUD, SFM, WITH_CLOUD, RunResult, RunSpec, seeding_method
 from splatseed.bench.runs import ERROR, RESULT, BenchRun, run_folder
 from splatseed.bench.scenes import SceneFacts, fingerprints, open_scene
+from splatseed.bench.versions import method_version, splatseed_version
 from splatseed.errors import (
     OutputError,
     ParameterError,
@@ -41,9 +42,9 @@ from splatseed.io.staging import MANIFEST, atomic_file, output_folder, write_jso
 from splatseed.methods import Upsampler, chooses_number, configure
 from splatseed.photos.loading import user_cache_dir
 from splatseed.pointcloud import PointCloud
-from splatseed.progress import Progress, StageTimes, available_cpus, silent, watched
-from splatseed.requirements import version_of
+from splatseed.progress import Progress, StageTimes, num_threads, silent, watched
 from splatseed.runtime.environment import worker_env
+from splatseed.runtime.fingerprint import fingerprint
 from splatseed.runtime.memory import peak_bytes
 from splatseed.runtime.tasks import ProcessWorkers, Report, Workers, run_tasks
 from splatseed.scene import Scene
@@ -95,7 +96,7 @@ def local_machine(jobs: int | None, backend: Backend, progress: Progress = silen
         named = [each for each in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if each]
         gpus = named or [f"{i}" for i in range(torch.cuda.device_count())]
     jobs = jobs or len(gpus)
-    threads = max(1, available_cpus() // jobs)
+    threads = num_threads(jobs)
     slots = [worker_env(threads, gpus[slot % len(gpus)]) for slot in range(jobs)]
     return Machine(chosen, jobs, threads, ProcessWorkers(slots))
 
@@ -178,6 +179,7 @@ def run_job(
     from splatseed.training.prepare import prepare_run  # noqa: PLC0415  (PyTorch)
 
     start = time.perf_counter()
+    check_versions(spec)
     with output_folder(run_folder(bench, spec), kind="bench", overwrite=True) as folder:
         progress("read", 0.0)
         scene = open_unchanged(spec.scene)
@@ -194,9 +196,7 @@ def run_job(
             spec.settings,
             cache_dir=user_cache_dir(),
             depth_cache=DepthCache(
-                bench
-                / "depths"
-                / f"{spec.scene.digest}_{every}_{size}_{len(views)}_{spec.repeat}.npz",
+                bench / "depths" / f"{_shared(spec)}_{size}_{len(views)}_{spec.repeat}.npz",
                 seeding_method(spec.arm.method) == DEFAULT_METHOD and not _is_full(scene, spec),
             ),
             progress=progress,
@@ -217,20 +217,41 @@ def run_job(
 
 def run_remotely(spec: RunSpec, options: RunOptions) -> tuple[RunResult, dict[str, bytes]]:
     """Carry out a run on a node of a cluster; returns the files of its folder by name."""
-    host, here = socket.gethostname(), version_of("splatseed") or ""
-    if here != spec.version:
-        expected = f"splatseed {spec.version} on the node {host}"
-        fix = "Install it on every node."
-        raise ParameterError(expected, found=here or "none", fix=fix)
     if not Path(spec.scene.path).exists():
         fix = "Every node must have the scenes at the same path: share the disk, or copy them."
-        expected = f"the scene {spec.scene.path} on the node {host}"
+        expected = f"the scene {spec.scene.path} on the node {socket.gethostname()}"
         raise SceneNotFoundError(expected, found="no such folder", fix=fix)
     with tempfile.TemporaryDirectory(prefix="splatseed-", ignore_cleanup_errors=True) as temporary:
         result = run_job(spec, options, Path(temporary))
         folder = run_folder(Path(temporary), spec)
         paths = [path for path in folder.rglob("*") if path.is_file() and path.name != MANIFEST]
         return result, {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
+
+
+def check_versions(spec: RunSpec) -> None:
+    """Check that the code of this process is that of the plan.
+
+    Raises:
+        ParameterError: It is not.
+    """
+    method = spec.arm.method
+    own = "" if method == SFM else method_version(seeding_method(method))
+    for what, planned, here in (
+        ("splatseed", spec.version, splatseed_version()), (method, spec.method_version, own)
+    ):  # fmt: skip
+        if here != planned:
+            raise ParameterError(
+                f"{what} {planned} on {socket.gethostname()}, as it was when the benchmark was "
+                "planned",
+                found=here or "none",
+                fix="Start the benchmark again to plan anew; all nodes of a cluster need one code.",
+            )
+
+
+def _shared(spec: RunSpec) -> str:
+    """The name of files that runs of the same scene, split and code share."""
+    code = fingerprint(spec.version.encode())[:8]
+    return f"{spec.scene.digest}_{spec.training.test_every}_{code}"
 
 
 def _collect_files(run: TrainingRun, folder: Path, *, models: bool) -> None:
@@ -265,7 +286,7 @@ def _score(
     from splatseed.splat.evaluate import evaluate_views  # noqa: PLC0415  (PyTorch)
 
     every = spec.training.test_every
-    cache = bench / "covisible" / f"{spec.scene.digest}_{every}.npz"
+    cache = bench / "covisible" / f"{_shared(spec)}.npz"
     grids = covisible.read_covisible(cache)
     if grids is None:
         grids = covisible.find_covisible(open_scene(replace(spec.scene, depth="")), every, progress)

@@ -22,9 +22,10 @@ from PIL import Image
 
 from splatseed.bench.comparisons import baseline_of, rivals
 from splatseed.bench.figures import shown_seeds
-from splatseed.bench.job import make_seeds, open_unchanged
+from splatseed.bench.job import check_versions, make_seeds, open_unchanged
 from splatseed.bench.plan import RunSpec
 from splatseed.bench.runs import run_folder
+from splatseed.bench.statistics import Difference
 from splatseed.bench.study import Study
 from splatseed.errors import SplatseedError
 from splatseed.findings import Finding
@@ -57,24 +58,50 @@ def scene_pictures(bench: Path, study: Study, progress: Progress = silent) -> Sc
         first = runs.drop_duplicates("seeds").set_index("seeds")["spec"].to_dict()
         shown = shown_seeds(study, [label for label in study.seeded if label in first])
         specs: dict[str, RunSpec] = {label: first[label] for label in shown[:_MAX_CLOUDS]}
-        digest = runs["spec"].iloc[0].scene.digest
-        content = [digest, *((name, spec.key) for name, spec in specs.items())]
-        key = fingerprint(json.dumps(content).encode())[:16]
-        name = re.sub(
-            r"[^\w.-]+", "_", f"clouds_{scene}_{key}"
-        )  # the scene's name may have slashes
-        with suppress(OSError):
-            pictures.clouds[scene] = name, read_file(bench / FIGURES / f"{name}.png")
-        if not specs or scene in pictures.clouds:
+        if _add_drawn(pictures, bench, scene, specs):
             continue
-        facts = [spec.scene for spec in specs.values()]
+        current = {label: spec for label, spec in specs.items() if _is_current(spec)}
+        if earlier := ", ".join(label for label in specs if label not in current):
+            text = f"{scene}: no picture of points by earlier code: {earlier}"
+            pictures.findings.append(Finding("missing-picture", text, subjects=(scene,)))
+        if not current or _add_drawn(pictures, bench, scene, current):
+            continue
+        facts = [spec.scene for spec in current.values()]
         try:
             opened = open_unchanged(next((scene for scene in facts if scene.depth), facts[0]))
-            pictures.clouds[scene] = name, _draw_seeds(opened, specs, progress, bench)
+            drawn = _draw_seeds(opened, current, progress, bench)
+            pictures.clouds[scene] = _picture_name(scene, current), drawn
         except SplatseedError as error:
             text = f"{scene}: no picture of its points: {error}"
             pictures.findings.append(Finding("missing-picture", text, subjects=(scene,)))
     return pictures
+
+
+def _picture_name(scene: str, specs: Mapping[str, RunSpec]) -> str:
+    digest = next(iter(specs.values())).scene.digest
+    content = [digest, *((label, spec.key) for label, spec in specs.items())]
+    key = fingerprint(json.dumps(content).encode())[:16]
+    return re.sub(r"[^\w.-]+", "_", f"clouds_{scene}_{key}")  # the scene's name may have slashes
+
+
+def _add_drawn(
+    pictures: ScenePictures, bench: Path, scene: str, specs: Mapping[str, RunSpec]
+) -> bool:
+    """Add a picture that an earlier report drew; returns whether there is one, or none to draw."""
+    if not specs:
+        return True
+    name = _picture_name(scene, specs)
+    with suppress(OSError):
+        pictures.clouds[scene] = name, read_file(bench / FIGURES / f"{name}.png")
+    return scene in pictures.clouds
+
+
+def _is_current(spec: RunSpec) -> bool:
+    """Whether the code that made a run is still there, to make its seeds again."""
+    with suppress(SplatseedError):
+        check_versions(spec)
+        return True
+    return False
 
 
 def _draw_seeds(
@@ -101,7 +128,7 @@ class ComparedView(NamedTuple):
 
     scene: str
     name: str
-    gain: float
+    gain: Difference
     pictures: Mapping[str, bytes]
     errors: Mapping[str, bytes]
     shape: float

@@ -11,11 +11,22 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
 from typing import Any, Self, get_args
 
 from splatseed.bench.scenes import PlannedScene, SceneFacts
+from splatseed.bench.versions import method_version, splatseed_version
 from splatseed.errors import ParameterError
-from splatseed.methods import METHODS, Profile, Upsampler, chooses_number, configure
+from splatseed.methods import (
+    METHODS,
+    OWN_METHOD,
+    Profile,
+    Upsampler,
+    absolute_place,
+    chooses_number,
+    configure,
+    method_label,
+)
 from splatseed.photos.sizes import TRAINED_SIDE
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scores import CurvePoint, EvalResult
@@ -112,7 +123,7 @@ class Arm:
         if self.method == SFM:
             return SFM
         ratio = f" {self.ratio:g}x" if self.ratio else ""
-        return f"{self.method}{ratio}" + (" (paper)" if self.profile == "paper" else "")
+        return method_label(self.method) + ratio + " (paper)" * (self.profile == "paper")
 
 
 @dataclass(frozen=True)
@@ -129,11 +140,15 @@ class RunSpec:
     parameters: Mapping[str, Any] = field(default_factory=dict)
     """The method's parameters that differ from its profile's."""
     version: str = ""
+    """That of splatseed, as of ``splatseed_version``."""
+    method_version: str = ""
+    """That of the method if it is not splatseed's, as of ``method_version``."""
 
     @property
     def key(self) -> str:
         """The fingerprint of everything that determines the result."""
         values = {**self.to_dict(), "scene": [getattr(self.scene, name) for name in _SCENE_KEY]}
+        values["arm"]["method"] = method_label(self.arm.method)  # its version covers its file
         text = json.dumps(values, sort_keys=True, separators=(",", ":"))
         return fingerprint(text.encode())
 
@@ -179,7 +194,10 @@ class RunSpec:
         """Convert to JSON values; settings with default values are omitted."""
         settings = vars(self.training).items()
         changed = {name: value for name, value in settings if value != getattr(_DEFAULT, name)}
-        return {**asdict(self), "parameters": dict(self.parameters), "training": changed}
+        values = {**asdict(self), "parameters": dict(self.parameters), "training": changed}
+        if not self.method_version:  # as in benchmarks without it, which keep their keys
+            del values["method_version"]
+        return values
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
@@ -248,7 +266,7 @@ class Plan:
     scenes: tuple[PlannedScene, ...] = ()
     methods: tuple[str, ...] = (SFM, "linear", "mls")
     """Seeding methods. ``sfm``, the baseline, adds no points. ``cloud+auto`` takes the points of a
-    scan, and fills its gaps by ``auto``."""
+    scan, and fills its gaps by ``auto``. ``my_method.py:Jitter`` is in a file."""
     ratios: tuple[float, ...] = (8.0,)
     """Total points per original; empty if budgets determine the number."""
     budgets: tuple[str, ...] = ()
@@ -278,13 +296,19 @@ class Plan:
     def __post_init__(self) -> None:
         object.__setattr__(self, "ratios", tuple(float(ratio) for ratio in self.ratios))
         object.__setattr__(self, "budgets", tuple(map(_budget, self.budgets)))
-        known = {"methods": (SFM, *METHODS, *WITH_CLOUD), "strategies": get_args(StrategyName),
+        placed = tuple(absolute_place(method, Path()) for method in self.methods)
+        object.__setattr__(self, "methods", placed)
+        by_method = {absolute_place(name, Path()): v for name, v in self.parameters.items()}
+        object.__setattr__(self, "parameters", by_method)
+        names = dict.fromkeys((*METHODS, *(m for m in (*placed, *by_method) if m in METHODS)))
+        known = {"methods": (SFM, *names, *WITH_CLOUD), "strategies": get_args(StrategyName),
                  "uncapped": get_args(StrategyName), "profiles": get_args(Profile),
-                 "parameters": tuple(METHODS)}  # fmt: skip
+                 "parameters": tuple(names)}  # fmt: skip
         for name, choices in known.items():
             for value in getattr(self, name):
                 if value not in choices:
-                    fix = did_you_mean(value, choices).strip() or HELP
+                    other = OWN_METHOD if name in {"methods", "parameters"} else HELP
+                    fix = did_you_mean(value, choices).strip() or other
                     raise ParameterError(f"{name} among {', '.join(choices)}", found=value, fix=fix)
         lists: dict[str, Any] = {name: getattr(self, name) for name in _LISTS}
         for name, given in {**lists, "scenes": [scene.label for scene in self.scenes]}.items():
@@ -302,6 +326,7 @@ class Plan:
             (long_side is None or long_side >= _MIN_SIDE,
              f"long_side of {_MIN_SIDE} or more", long_side),
             (long_side is None or training.factor == 1, "long_side or data_factor", "both"),
+            (training.test_every, "test views to compare by (test_every of 2 or more)", "none"),
             (self.repeats >= 1, "repeats of 1 or more", self.repeats),
         ):  # fmt: skip
             if not valid:
@@ -349,18 +374,17 @@ class Plan:
         return [p for i, p in enumerate(self.profiles) if seen[i] not in seen[:i]]
 
 
-def plan_runs(
-    plan: Plan, scenes: Sequence[SceneFacts], backend: Backend, version: str
-) -> list[RunSpec]:
-    """Unroll a plan to its runs, in the order in which to run them.
+def plan_runs(plan: Plan, scenes: Sequence[SceneFacts], backend: Backend) -> list[RunSpec]:
+    """Unroll a plan to its runs with the present code, in the order in which to run them.
 
     Scenes without depth maps or a scan get no runs of methods that need them. ``backend`` is not
     "auto".
     """
+    versions = {method: method_version(seeding_method(method)) for method in plan.methods}
     return [
         RunSpec(
             _needed(scene, arm.method), arm, repeat, _training(plan, scene, arm, backend),
-            plan.parameters_of(arm.method), version,
+            plan.parameters_of(arm.method), splatseed_version(), versions[arm.method],
         )
         for repeat in range(plan.repeats)
         for scene in scenes

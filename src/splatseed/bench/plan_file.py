@@ -17,6 +17,7 @@ from splatseed.bench.plan import SHARED, Plan
 from splatseed.bench.scenes import DEMO, PlannedScene
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import StrPath, read_text
+from splatseed.methods import absolute_place
 from splatseed.settings import describe_type, fits
 from splatseed.training.settings import TrainSettings
 
@@ -57,6 +58,9 @@ def read_plan(path: StrPath, folder: Path | None = None) -> Plan:
     values = {key: tuple(v) if isinstance(v, list) else v for key, v in content.items()}
     folder = folder or path.parent
     values["scenes"] = tuple(_scene(path, folder, scene) for scene in content.get("scenes", ()))
+    if "methods" in values:
+        values["methods"] = tuple(absolute_place(name, path.parent) for name in values["methods"])
+    values["parameters"] = {absolute_place(name, path.parent): v for name, v in methods.items()}
     try:
         training = TrainSettings(**{name: values.pop(name) for name in SHARED if name in values})
         return Plan(**values, training=training)

@@ -170,8 +170,7 @@ def conclude(study: Study) -> tuple[str, ...]:
     at = " under one budget of Gaussians" if study.settings["budget"] else ""
     at = at if unequal_numbers(study) else " with equal numbers of Gaussians"
     equal: ComparedArm | None = None
-    place = "is best" if best.gain.verdict == "better" else "has the highest mean"
-    first = f"{best.arm.label} {place}: "
+    first = f"{_place(best)}: "
     if best.gain.mean < _MIN_GAIN:
         first = f"no arm beats {base.label}: {best.arm.label} is closest, "
     conclusions = [f"On {counted(len(best.scenes), 'scene')}{at}, {first}{_against(best, base)}."]
@@ -187,7 +186,7 @@ def conclude(study: Study) -> tuple[str, ...]:
     rest = [arm for arm in others if (arm.arm.seeds == SFM) != from_sfm]
     if rest and rest[0] is not equal:
         kind = "Of arms with other seeds" if from_sfm else "Of arms without new points"
-        conclusions.append(f"{kind}, {rest[0].arm.label} is best: {_against(rest[0], base)}.")
+        conclusions.append(f"{kind}, {_place(rest[0])}: {_against(rest[0], base)}.")
     lead, time_ratio = best.gains["in_time"], best.gains["seconds"]
     if lead is not None:
         position = f"{abs(lead.mean):.2f} dB {'ahead' if lead.mean > 0 else 'behind'}"
@@ -251,16 +250,23 @@ def _at_equal_numbers(
         )
     else:
         yield (
-            f"Of arms with no more Gaussians than {label}, {equal.arm.label} is best: "
+            f"Of arms with no more Gaussians than {label}, {_place(equal)}: "
             f"{_against(equal, base.arm)}."
         )
+
+
+def _place(arm: ComparedArm) -> str:
+    """State that an arm, which has the highest mean gain of some, is best if that is certain."""
+    return (
+        f"{arm.arm.label} {'is best' if arm.gain.verdict == 'better' else 'has the highest mean'}"
+    )
 
 
 def _against(arm: ComparedArm, base: ArmKey) -> str:
     gain, worst = arm.gain, ""
     if len(arm.on_scene) > 1:
         scene, minimum = next(iter(arm.on_scene.items()))
-        worst = f"; on {scene}, its worst scene, {_difference(minimum)}"
+        worst = f"; on {scene}, its worst scene, {_difference(minimum.mean)}{minimum.caveat}"
     if abs(gain.mean) < _MIN_GAIN:
         return f"level with {base.label}{worst}"
     spread = "" if math.isnan(gain.se) else f" (± {gain.se:.2f} over {gain.unit}s)"
@@ -368,7 +374,8 @@ def _views(view: pictures.ComparedView) -> Part:
     base, best, _ = view.pictures
     caption = (
         f"{view.scene}, test view {view.name}: {base} on the left, {best} on the right "
-        f"({Number(view.gain, signed=True)} dB over all test views of this scene)."
+        f"({Number(view.gain.mean, signed=True)} dB over all test views of this scene)"
+        f"{view.gain.caveat}."
     )
     urls, errors = (
         {name: _url(content, "image/jpeg") for name, content in each.items()}

@@ -1,4 +1,4 @@
-"""Read and lock a benchmark's folder, and record what is planned.
+"""Read a benchmark's folder, and record what is planned.
 
 ``planned.json`` records the calls of the command and the runs of the last plan. A folder
 ``runs/KEY`` with a ``result.json`` is a finished run, which is not repeated; with an ``error.json``
@@ -12,9 +12,10 @@ import os
 import platform
 import shlex
 import socket
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from statistics import median
@@ -22,15 +23,9 @@ from typing import Any
 
 from splatseed.bench.plan import RunResult, RunSpec
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
+from splatseed.findings import Finding
 from splatseed.io.files import StrPath, read_text
-from splatseed.io.staging import (
-    MANIFEST,
-    check_output,
-    check_separate,
-    locked,
-    read_manifest,
-    write_json,
-)
+from splatseed.io.staging import MANIFEST, check_output, check_separate, read_manifest, write_json
 from splatseed.requirements import version_of
 from splatseed.text import counted
 
@@ -112,6 +107,39 @@ def read_runs(bench: StrPath) -> list[BenchRun]:
     return [*runs, *(_read(folder) for folder in finished if folder.name not in known)]
 
 
+def changed_code(bench: Path, planned: Sequence[RunSpec]) -> Iterator[Finding]:
+    """Find whether ``planned`` runs repeat finished ones of a benchmark with other code."""
+    repeated = dict[tuple[str, str], RunSpec]()
+    for spec in planned:
+        if not (run_folder(bench, spec) / RESULT).is_file():
+            repeated[_without_code(spec)] = spec
+    changes, count = defaultdict[str, set[str]](set), set[tuple[str, str]]()
+    for path in bench.glob(f"runs/*/{RESULT}"):
+        with suppress(SceneFormatError):  # of another version's layout
+            old = _read(path.parent).spec
+            key = _without_code(old)
+            if (new := repeated.get(key)) is not None:
+                count.add(key)
+                for what, before, now in (
+                    ("splatseed", old.version, new.version),
+                    (f"method {new.arm.method}", old.method_version, new.method_version),
+                ):
+                    if before != now:
+                        changes[f"{what} is {now}"].add(before or "of an unknown version")
+    if count:
+        parts = [f"{now}, was {' and '.join(sorted(before))}" for now, before in changes.items()]
+        text = (
+            f"The code has changed ({counted(len(count), 'run')} to repeat): {'; '.join(parts)}. "
+            "The earlier results are kept apart."
+        )
+        yield Finding("changed-code", text, "info", subjects=tuple(changes))
+
+
+def _without_code(spec: RunSpec) -> tuple[str, str]:
+    """What is the same of a run by other code; files of one name are different methods."""
+    return replace(spec, version="", method_version="").key, spec.arm.method
+
+
 def count_runs(runs: Sequence[BenchRun]) -> str:
     """Describe the numbers of finished, failed and pending runs."""
     done = sum(run.result is not None for run in runs)
@@ -137,23 +165,6 @@ def check_bench_folder(folder: Path, protect: Sequence[Path]) -> None:
         expected = f"the folder of splatseed bench, or a new one, at {folder}"
         found = f"what splatseed {kind} wrote"
         raise OutputError(expected, found=found, fix="Choose another folder.")
-
-
-@contextmanager
-def locked_bench(bench: Path) -> Iterator[None]:
-    """Lock a benchmark's folder against other processes.
-
-    Raises:
-        OutputError: Another process holds the lock.
-    """
-    with ExitStack() as stack:
-        try:
-            stack.enter_context(locked(bench))
-        except BlockingIOError:
-            fix = "Wait until it ends, stop it, or name another folder."
-            expected = f"no other process that runs {bench}"
-            raise OutputError(expected, found="one", fix=fix) from None
-        yield
 
 
 def record_plan(bench: Path, verb: str, specs: Iterable[RunSpec], arguments: Sequence[str]) -> None:

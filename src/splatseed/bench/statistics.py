@@ -29,9 +29,9 @@ LEVEL = 0.05
 EXACT = 1e-9
 """Standard errors below this are rounding errors of equal runs."""
 MIN_DF = 3
-"""Degrees of freedom from which a difference that is no claim is called noise. Of 2, the standard
+"""Degrees of freedom from which anything is claimed, a difference or noise. Of 2, the standard
 deviation is known to within a factor of 12 (95% interval: 0.5 to 6.3 times the estimate), of 3 to
-within 7: fewer can support a claim, but not tell a small difference from none."""
+within 7."""
 
 Verdict = Literal["better", "worse", "within noise", "too few to tell"]
 Unit = Literal["repeat", "scene"]
@@ -61,15 +61,15 @@ class Difference:
 
     @property
     def verdict(self) -> Verdict:
-        """The rule of significance: a claim if the adjusted p is at most ``LEVEL``.
+        """The rule of significance: a claim if the adjusted p is at most ``LEVEL``, else noise.
 
-        Otherwise the difference is within noise, or, with fewer than ``MIN_DF`` degrees of freedom,
-        based on too few repeats or scenes to tell.
+        With fewer than ``MIN_DF`` degrees of freedom, repeats or scenes are too few to tell.
         """
-        if self.adjusted <= LEVEL:  # not if NaN
-            return "better" if self.mean > 0 else "worse"
-        known = self.df >= MIN_DF and not math.isnan(self.adjusted)
-        return "within noise" if known else "too few to tell"
+        if self.df < MIN_DF or math.isnan(self.adjusted):
+            return "too few to tell"
+        if self.adjusted > LEVEL:
+            return "within noise"
+        return "better" if self.mean > 0 else "worse"
 
     @property
     def caveat(self) -> str:

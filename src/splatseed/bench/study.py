@@ -128,6 +128,13 @@ class Study:
             ),
             f"backend {settings['backend']}",
             f"splatseed {settings['version']}" if settings["version"] else "",
+            *sorted(
+                {
+                    f"{spec.arm.method} {spec.method_version}"
+                    for spec in self.runs["spec"]
+                    if spec.method_version
+                }
+            ),
             f"{repeats} repeat{'' if high == 1 else 's'}" if len(counts) else "",
         ]
         return ", ".join(filter(None, parts))
@@ -178,6 +185,9 @@ def _study(settings: Mapping[str, object], runs: Sequence[BenchRun]) -> Study:
         for kind, found in beside.items():
             found[of.digest].add(getattr(of, _EXTRA_DIGESTS[kind]))
     several = [kind for kind in beside if any(len(e - {""}) > 1 for e in beside[kind].values())]
+    codes = defaultdict[str, set[str]](set)
+    for run in runs:
+        codes[run.spec.arm.label].add(run.spec.method_version)
     variants: dict[str, Arm] = {}
     factors: dict[str, int] = {}
     rows, odd = [], []
@@ -190,7 +200,7 @@ def _study(settings: Mapping[str, object], runs: Sequence[BenchRun]) -> Study:
         if not math.isfinite(result.psnr):
             odd.append(f"{scene}, {arm.label}, {arm.strategy}, repeat {spec.repeat + 1}")
             continue
-        label = _label(spec, several)
+        label = _label(spec, several, with_version=len(codes[arm.label]) > 1)
         variants.setdefault(label, arm)
         factors[scene] = min(spec.training.factor, factors.get(scene, 10**9))
         values: tuple[object, ...] = (arm.strategy, scene, label, spec.repeat, spec, result)
@@ -226,8 +236,11 @@ def _measures(result: RunResult) -> dict[str, float]:
     return {name: math.nan if value is None else float(value) for name, value in measures.items()}
 
 
-def _label(spec: RunSpec, several: Sequence[str]) -> str:
-    """Label a variant; adds digests of depth maps or scans if a scene has ``several``."""
+def _label(spec: RunSpec, several: Sequence[str], *, with_version: bool) -> str:
+    """Label a variant; adds digests of depth maps or scans if a scene has ``several``.
+
+    ``with_version``: there are runs with several versions of the method.
+    """
     if spec.arm.method == SFM:
         return SFM
     # A plan sets these for every method that uses photographs.
@@ -238,4 +251,6 @@ def _label(spec: RunSpec, several: Sequence[str]) -> str:
     changed = [f"{k}={v}" for k, v in sorted(spec.parameters.items()) if (k, v) not in usual]
     digests = {kind: getattr(spec.scene, _EXTRA_DIGESTS[kind])[:4] for kind in several}
     changed += [f"{kind}={digest}" for kind, digest in digests.items() if digest]
+    # Six digits of its fingerprint.
+    changed += [f"code={spec.method_version[:-6] or 'unknown'}"] * with_version
     return " ".join([spec.arm.label, *changed])

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from statistics import fmean, stdev
 
 from splatseed.bench import comparisons
-from splatseed.bench.comparisons import ArmKey, compared_arms, gains
+from splatseed.bench.comparisons import ArmKey, ComparedArm, compared_arms, gains
 from splatseed.bench.plan import SFM
 from splatseed.bench.statistics import Difference, Verdict
 from splatseed.bench.study import Study
@@ -153,20 +153,22 @@ def arm_table(study: Study) -> Table:
 def scene_arm_table(study: Study, base: ArmKey) -> Table:
     """Tabulate the gain of each arm on each scene; the row of the baseline has its PSNR."""
 
-    def cell(arm: ArmKey, scene: str) -> Cell:
+    def cell(arm: ComparedArm, scene: str) -> Cell:
         first = study.results(base.strategy, scene, base.seeds)
-        own = study.results(arm.strategy, scene, arm.seeds)
+        own = study.results(arm.arm.strategy, scene, arm.arm.seeds)
         gained = [own[repeat].psnr - first[repeat].psnr for repeat in first.keys() & own.keys()]
         if not gained:
             return ""
-        if arm == base:
+        if arm.arm == base:
             return Number(fmean(run.psnr for run in own.values()))
         low, high = (Number(end, signed=True) for end in (min(gained), max(gained)))
-        span = f"({low} to {high})" if len(gained) > 1 else ""
-        return Number(fmean(gained), signed=True, text=span)
+        span, gain = f"({low} to {high})" if len(gained) > 1 else "", arm.on_scene[scene]
+        return Number(gain.mean, signed=True, text=span, mark=verdict_mark(gain))
 
-    arms = [each.arm for each in compared_arms(study)]
-    rows = [(a.seeds, a.strategy, *(cell(a, scene) for scene in study.scenes)) for a in arms]
+    rows = [
+        (each.arm.seeds, each.arm.strategy, *(cell(each, scene) for scene in study.scenes))
+        for each in compared_arms(study)
+    ]
     header = ("seeds", "strategy", *study.scenes)
     return make_table("arms_by_scene", header, rows, base=base.label)
 

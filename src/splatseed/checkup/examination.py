@@ -263,8 +263,7 @@ def comparable(scene: Scene, test_every: int = 0) -> tuple[Image, ...]:
 
     With ``test_every`` 0, test views are those that the scene lists.
     """
-    chosen = scene.split(test_every)[0] if test_every or scene.listed else scene.images
-    return tuple(sorted((im for im in chosen if im.has_photograph), key=lambda im: im.name))
+    return tuple(image for image in scene.split(test_every)[0] if image.has_photograph)
 
 
 def with_fitting_points(

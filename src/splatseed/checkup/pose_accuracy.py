@@ -186,7 +186,7 @@ def given_pose_error(
     refined poses gain 2.3 dB, all views have 0.50 px, which is exact, and those to train 0.74.
     Without an estimate, as poses that are far off leave too few corners there, all are measured.
     """
-    names = {image.name for image in scene.split()[0]}
+    names = {image.name for image in scene.split(scene.default_test_every)[0]}
     train = [image for image in images if image.name in names]
     error = estimate_pose_error(scene, train, progress) if len(train) > 1 else None
     return error or estimate_pose_error(scene, images, progress)

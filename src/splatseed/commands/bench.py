@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import sys
+import tomllib
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -28,22 +30,32 @@ from splatseed.bench.plan_file import PLAN, plan_text, read_plan
 from splatseed.bench.runs import (
     ERROR,
     BenchRun,
+    changed_code,
     check_bench_folder,
     count_runs,
     estimate_seconds,
-    locked_bench,
     read_run,
     record_plan,
     run_folder,
 )
 from splatseed.bench.scenes import PlannedScene, SceneFacts, survey
 from splatseed.commands.options import check_minimum, parse_options, refuse
-from splatseed.console import ERR, OUT, print_note, print_pairs, print_table, stage_display
+from splatseed.console import (
+    ERR,
+    OUT,
+    add_results,
+    print_message,
+    print_next,
+    print_note,
+    print_pairs,
+    print_table,
+    stage_display,
+)
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.findings import Finding
 from splatseed.io.staging import atomic_file
 from splatseed.methods import Profile
-from splatseed.requirements import require, version_of
+from splatseed.requirements import require
 from splatseed.runtime.interruption import exit_code
 from splatseed.runtime.memory import check_memory
 from splatseed.text import counted, did_you_mean, format_duration, name_some, quoted, visible
@@ -80,7 +92,7 @@ class Options:
     scenes: tuple[str, ...] = ()
     """Scene folders with photographs; demo: is a synthetic room. With --data: names of scenes."""
     methods: Annotated[tuple[str, ...], _list("--method", _DEFAULT.methods)] = ()
-    """Seeding methods; sfm, the original points, is the baseline."""
+    """Seeding methods; sfm, the original points, is the baseline; FILE.py:NAME is your own."""
     ratios: Annotated[tuple[float, ...], _list("--ratio", [f"{r:g}" for r in _DEFAULT.ratios])] = ()
     """Total points per original point."""
     budgets: Annotated[tuple[str, ...], _list("--budget", [fair_budget(_DEFAULT.ratios)])] = ()
@@ -212,7 +224,7 @@ def _scenes(plan: Plan, options: Options) -> list[PlannedScene]:
 @contextmanager
 def open_machine(options: Options, backend: Backend) -> Iterator[Machine]:
     """Open the workers for a backend."""
-    require("torch", "gsplat", "flip_evaluator", "pandas")
+    require("torch", "gsplat", "flip_evaluator", "pandas", *["ray"] * (options.executor == "ray"))
     if options.executor == "ray":
         with ray_machine(options.address, options.jobs, backend) as machine:
             yield machine
@@ -255,9 +267,10 @@ def _prepare(
         raise SceneNotFoundError(expected, found=found, fix="Name the folder that holds them.")
     plan = replace(plan, scenes=tuple(scene for scene, _ in present))
     scenes = [facts for _, facts in present]
-    specs = plan_runs(plan, scenes, machine.backend, version_of("splatseed") or "")
+    specs = plan_runs(plan, scenes, machine.backend)
     findings = [*missing, *_budget_findings(options, plan), *of_scenes]
     findings += [*_data_findings(plan, scenes), *_full_budgets(plan, specs)]
+    findings += changed_code(options.output, specs) if options.output else ()
     fix = "Name other methods, or what these need."
     refuse((not specs, "a plan with runs", "; ".join(map(str, findings)) or "none", fix))
     # The memory of a cluster's nodes is unknown.
@@ -336,6 +349,7 @@ def _bench(options: Options, plan: Plan, machine: Machine, arguments: Sequence[s
         plan, _, specs, findings = _prepare(options, plan, machine, demo)
         runs = [read_run(bench, spec) if bench else BenchRun(spec) for spec in specs]
         lines = [*map(str, findings), *_announcement(plan, runs, machine)]
+        add_results(plan=tomllib.loads(plan_text(plan)), num_runs=len(runs), notes=lines)
         comments = "".join(f"# {' '.join(line.split())}\n" for line in lines)
         OUT.print(f"{plan_text(plan)}\n{comments}", end="", soft_wrap=True)
         return
@@ -349,9 +363,8 @@ def _bench(options: Options, plan: Plan, machine: Machine, arguments: Sequence[s
     print_note(*findings)
     names = ", ".join(f"{visible(s.name)} ({s.num_points:,} points)" for s in scenes)
     lines = [names, *_announcement(plan, runs, machine), visible(bench)]
-    OUT.print("\n  -> ".join(lines), soft_wrap=True)
-    with locked_bench(bench):
-        completed = execute(bench, runs, machine, RunOptions(plan.keep_models, has_lpips_weights()))
+    print_message("\n  -> ".join(lines))
+    completed = execute(bench, runs, machine, RunOptions(plan.keep_models, has_lpips_weights()))
     runs = [read_run(bench, spec) for spec in specs]
     _print_summary(bench, runs)
     if not completed:
@@ -408,10 +421,10 @@ def execute(bench: Path, runs: Sequence[BenchRun], machine: Machine, options: Ru
                 if run.result:
                     count, seconds = run.result.num_gaussians, run.result.wall_seconds
                     outcome = f": {run.result.psnr:.2f} dB, {count:,} Gaussians, {seconds:.0f} s"
-                OUT.print(f"[{number}/{len(runs)}] {_describe(run.spec)}{outcome}", soft_wrap=True)
+                print_message(f"[{number}/{len(runs)}] {_describe(run.spec)}{outcome}")
                 bar.advance(overall)
     except KeyboardInterrupt:
-        ERR.print("stopped: interrupted runs start anew next time")
+        print_message("stopped: interrupted runs start anew next time", logging.WARNING)
         return False
     return True
 
@@ -426,13 +439,25 @@ def _print_summary(bench: Path, runs: Sequence[BenchRun]) -> None:
     from splatseed.bench.study import studies
     from splatseed.bench.study_tables import arm_table
 
-    for study in studies(runs):
-        _print_table(arm_table(study))
+    tables = [arm_table(study) for study in studies(runs)]
+    for table in tables:
+        _print_table(table)
+    shown = [{"title": t.title, "header": t.header, "rows": t.shown().to_numpy()} for t in tables]
+    add_results(output=bench, runs=[_facts(bench, run) for run in runs], tables=shown)
     print_failures(bench, runs)
     pending = sum(run.result is None for run in runs)
     resume = [(f"the other {counted(pending, 'run')}", f"splatseed bench -o {quoted(bench)}")]
     report = ("tables and pictures", f"splatseed bench report {quoted(bench)}")
-    print_pairs("next", [*(resume if pending else []), report])
+    print_next([*(resume if pending else []), report])
+
+
+def _facts(bench: Path, run: BenchRun) -> dict[str, object]:
+    """Return what ``--json`` prints of a run; its folder has the rest."""
+    spec, result = run.spec, run.result
+    facts = {"scene": spec.scene.name, **asdict(spec.arm), "repeat": spec.repeat}
+    facts |= {"folder": run_folder(bench, spec), "error": run.error or None}
+    names = ("psnr", "num_seeds", "num_gaussians", "seconds")
+    return {**facts, **{name: getattr(result, name, None) for name in names}}
 
 
 def print_failures(bench: Path, runs: Sequence[BenchRun]) -> None:
@@ -460,7 +485,8 @@ def _report(arguments: list[str]) -> None:
     figures = f"{report.figures} in {options.bench / 'figures'}"
     rows = [("report", str(report.path)), ("tables", kinds), ("figures", figures)]
     print_pairs(str(options.bench), rows)
-    print_pairs("next", [("", f"open {quoted(report.path)} in a browser")])
+    add_results(report=report.path, summary=report.summary)
+    print_next([("", f"open {quoted(report.path)} in a browser")])
 
 
 def _print_table(table: Table) -> None:

@@ -30,7 +30,15 @@ import numpy as np
 import tyro
 
 from splatseed.commands.options import parse_options, refuse
-from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
+from splatseed.console import (
+    StageClock,
+    add_results,
+    print_next,
+    print_note,
+    print_pairs,
+    print_table,
+    stage_display,
+)
 from splatseed.errors import MissingDependencyError
 from splatseed.findings import Finding
 from splatseed.io import find_depths, load_scene, write_scene
@@ -113,7 +121,7 @@ def run(arguments: list[str]) -> None:
     longer = f"splatseed train {quoted(out / f'scene_{SHOWN}')} --max-steps 3000 -o RUN"
     score = ("the scores again", f"splatseed evaluate {quoted(out / f'run_{POSES}')}")
     commands = [("another method", another), ("a longer run", longer)]
-    print_pairs("next", [*commands, *([score] if trained else [])])
+    print_next([*commands, *([score] if trained else [])])
 
 
 def _upsample_by(name: str, scene: Scene, ratio: float = RATIO) -> PointCloud:
@@ -281,6 +289,7 @@ def _summarise(
         *(("pictures" if not i else "", str(out / n)) for i, n in enumerate(PICTURES)),
     ]
     print_pairs("splatseed demo", rows)
+    add_results(output=out, points=number, geometry=dict(scores))
 
 
 # Training -----------------------------------------------------------------------------------------
@@ -405,3 +414,4 @@ def _summarise_training(
         "picture": str(picture),
     }
     print_pairs("what this shows", list(facts.items()))
+    add_results(training={ARMS[name]: each.to_dict() for name, each in results.items()})

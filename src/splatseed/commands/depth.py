@@ -13,7 +13,7 @@ import tyro
 
 from splatseed.commands.next_steps import after_depth, show_maps
 from splatseed.commands.options import check_minimum, parse_options, refuse
-from splatseed.console import OUT, print_note, print_pairs, stage_display
+from splatseed.console import OUT, add_results, print_next, print_note, print_pairs, stage_display
 from splatseed.depth.stereo.maps import MIN_SIZE
 from splatseed.depthmap import DepthKind
 from splatseed.findings import Finding, without_kinds
@@ -72,6 +72,8 @@ def run(arguments: list[str]) -> None:
         (options.model is None and options.depth_kind is not None, "--depth-kind with --model",
          "no --model", "Leave out --depth-kind: stereo's depth is planar."),
     )  # fmt: skip
+    if options.model is not None:
+        require("torch", "transformers")
     check_output(options.output, kind="depth", overwrite=options.overwrite, protect=[options.scene])
     if options.model is None:
         _run_stereo(options)
@@ -89,7 +91,6 @@ def _run_network(options: Options, model: str) -> None:
         clock("read", 0.0)
         scene = load_scene(options.scene, require_points=False)
         clock("load network", 0.0)
-        require("torch", "transformers")
         from splatseed.depth.monocular import estimate_depths, load_network
 
         network = load_network(model, depth_kind=options.depth_kind)
@@ -110,13 +111,14 @@ def _run_network(options: Options, model: str) -> None:
         ("output", str(options.output)),
     ]
     print_pairs("splatseed depth", rows)
+    add_results(output=options.output, maps=num, seconds=report.seconds, network=model, **facts)
     print_note(*scene.findings)
     if report.flat:
         flat = name_some(report.flat, NAMES_SHOWN)
         text = f"the network predicted no depth (a constant map, or none) for: {flat}"
         print_note(Finding("no-depth", text, subjects=tuple(report.flat)))
     known = num * min(math.prod(size) for size in sizes)
-    print_pairs("next", after_depth(options.scene, scene, options.output, known, aligned=False))
+    print_next(after_depth(options.scene, scene, options.output, known, aligned=False))
 
 
 def _run_stereo(options: Options) -> None:
@@ -159,6 +161,8 @@ def _summarise_stereo(
         f"pixels confirmed by other views, in {seconds:.1f} s, written to {visible(path)}",
         soft_wrap=True,
     )
+    share = {"maps": report.num_maps, "confirmed": report.share_known}
+    add_results(output=path, **share, seconds=seconds)
     print_note(*without_kinds(scene.findings, "lens-distortion"))
     if report.empty:
         text = f"no other view confirms any pixel of: {name_some(report.empty, NAMES_SHOWN)}"
@@ -167,14 +171,14 @@ def _summarise_stereo(
         fuse = f"--workspace_path {quoted(path)} --output_path {quoted(path / 'fused.ply')}"
         fuse = f"colmap stereo_fusion {fuse} --StereoFusion.min_num_pixels {MIN_PIXELS}"
         # The workspace is itself a scene, without distortion.
-        print_pairs("next", [show_maps(path, path), ("fuse", fuse)])
+        print_next([show_maps(path, path), ("fuse", fuse)])
         return
     if is_distorted(scene):
         text = "the cameras have lens distortion, and these maps belong to the undistorted "
         text += "photographs: --colmap writes both, as a scene to continue with"
         print_note(Finding("lens-distortion", text, "info"))
     known = report.num_known
-    print_pairs("next", after_depth(options.scene, scene, path, known, aligned=True))
+    print_next(after_depth(options.scene, scene, path, known, aligned=True))
 
 
 def _size_range(sizes: Sequence[Sequence[int]]) -> str:

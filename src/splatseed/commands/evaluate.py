@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from splatseed.commands.options import check_free, parse_options
-from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
+from splatseed.console import (
+    StageClock,
+    add_results,
+    print_note,
+    print_pairs,
+    print_table,
+    stage_display,
+)
 from splatseed.findings import Finding
 from splatseed.io.staging import check_output, output_folder, write_json
 from splatseed.photos.view import View
@@ -120,15 +127,16 @@ def _score(
                 write_comparison(folder / names[view.name], view.photograph, render, errors)
 
             result = score(on_view=draw)
+    content: dict[str, object] = {
+        "model": options.model,
+        "scene": evaluation.scene,
+        "data_factor": model.data_factor,
+        "test_every": evaluation.test_every,
+        "background": name_background(model.scene.background),
+        **result.to_dict(),
+    }
+    add_results(**content)
     if options.output is not None:
-        content = {
-            "model": options.model,
-            "scene": evaluation.scene,
-            "data_factor": model.data_factor,
-            "test_every": evaluation.test_every,
-            "background": name_background(model.scene.background),
-            **result.to_dict(),
-        }
         if findings := evaluation.findings(model):
             content["findings"] = [asdict(each) for each in findings]
             content["notes"] = [str(each) for each in findings]

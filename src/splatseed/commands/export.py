@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 
 from splatseed.commands.options import check_free, parse_options, refuse
-from splatseed.console import print_note, print_pairs, stage_display
+from splatseed.console import add_results, print_next, print_note, print_pairs, stage_display
 from splatseed.errors import InputError, ParameterError
 from splatseed.findings import Finding
 from splatseed.io.origin import RECENTER, choose_origin, format_offset, offset_beside, write_offset
@@ -136,6 +136,13 @@ def run(arguments: list[str]) -> None:
         ("output", str(target)),
     ]
     print_pairs("splatseed export", rows)
+    add_results(
+        output=target, format=job.format, gaussians=len(kept), of=len(gaussians), bytes=after
+    )
+    if loss is not None:
+        alike = dict(zip(list(stages)[1:], loss.likeness, strict=True))
+        psnr = dict(zip(stages, loss.scores, strict=bool(loss.scores)))
+        add_results(views=loss.views, psnr=psnr, likeness=alike)
     print_note(*findings, *_format_findings(job), *_loss_findings(loss, stages, job))
     _print_next(job)
 
@@ -171,6 +178,8 @@ def _checked(options: Options) -> _Job:
     )  # fmt: skip
     if cleans:
         require("torch")
+    if named and options.budget is not None:
+        require("torch", "gsplat")
     budget = None if options.budget is None else parse_budget(options.budget, 0)
     if not named and scene is not None and not scene.exists():
         scene = None  # the run was made elsewhere
@@ -323,7 +332,8 @@ def _loss(
         frame = frame_of_model(around, NO_POINTS, models[0])
         return measure_loss(models, around, frame, device, progress)
     test = [replace(view, photograph=NO_PIXELS) if cropped else view for view in views.test]
-    return measure_loss(models, test, views.frame, device, progress, views.scene.background)
+    background = views.scene.background
+    return measure_loss(models, test, views.frame, device, progress, background, views.label)
 
 
 def _loss_rows(
@@ -334,7 +344,7 @@ def _loss_rows(
         return []
     if loss.scores:
         scores = ", ".join(f"{n} {x:.2f} dB" for n, x in zip(stages, loss.scores, strict=True))
-        return [("score", f"{scores}; PSNR, {counted(loss.views, 'test view')}")]
+        return [("score", f"{scores}; PSNR, {counted(loss.views, loss.label)}")]
     where = "around it" if views is None else "of its scene"
     alike = ", ".join(
         f"{name} {x:.1f} dB"
@@ -373,12 +383,14 @@ def _print_next(job: _Job) -> None:
         sog = quoted(options.output.with_suffix(".sog"))
         packed = f"splatseed export {quoted(options.model)} -o {sog}"
         opened = "open it in a browser, here or wherever you send it"
-        print_pairs("next", [(opened, link), (label, packed)])
+        print_next([(opened, link), (label, packed)])
         return
     rows = [("look at it", f"splatseed view {quoted(options.output)}")]
-    if job.transform is None:  # else its scene is elsewhere
+    split = job.config.get("split")
+    unscored = isinstance(split, dict) and not split.get("test")  # nothing was held out
+    if job.transform is None and not unscored:  # moved, its scene is elsewhere
         rows.append(("score it", _scoring_command(job)))
-    print_pairs("next", rows)
+    print_next(rows)
 
 
 def _scoring_command(job: _Job) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 
 from splatseed.commands.options import check_free, parse_options, refuse
-from splatseed.console import print_note, print_pairs, stage_display
+from splatseed.console import add_results, print_note, print_pairs, stage_display
 from splatseed.errors import ParameterError
 from splatseed.findings import Finding
 from splatseed.io.origin import find_shift
@@ -166,7 +166,10 @@ def run(arguments: list[str]) -> None:
     if path is not None:
         size = views[0].width, views[0].height
         print_note(*path.findings(size, len(models[0]), len(items[0].model)))
-    print_note(*videos.unseen_findings(shown, names))
+    print_note(
+        *videos.unseen_findings(shown, names),
+        *videos.guessed_findings(renderers[0], views, items[0].train_views),
+    )
     if items[0].moved and flight.given and not flight.given.of_scene and options.transform is None:
         text = f"{options.file} is taken to be in the model's frame, too, and was transformed with "
         text += "it; for the scene's frame, pass --transform none."
@@ -189,6 +192,7 @@ def _summarise(options: Options, flight: _Flight, seconds: float) -> None:
         ("video" if options.is_video else "pictures", written),
     ]
     print_pairs("splatseed flight", rows)
+    add_results(output=options.output, frames=number, sizes=list(ends), seconds=seconds)
 
 
 def _open_models(options: Options) -> list[ViewerItem]:

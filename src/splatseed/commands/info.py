@@ -1,16 +1,14 @@
 """``splatseed info``: the contents of a scene, its problems, and the next commands.
 
-With ``--json``, stdout is one JSON object: lengths are in scene units, five numbers are percentiles
-5, 25, 50, 75 and 95, and null is a number that is not finite. Keys are only ever added.
+With ``--json``, lengths are in scene units, and five numbers are percentiles 5, 25, 50, 75 and 95.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, is_dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -25,6 +23,9 @@ from splatseed.commands.options import check_free, parse_options, refuse
 from splatseed.console import (
     OUT,
     StageClock,
+    add_findings,
+    add_results,
+    print_next,
     print_note,
     print_pairs,
     print_table,
@@ -84,8 +85,6 @@ class Options:
     """The trainer that you plan to use: the advice and the commands are for it."""
     all_photographs: bool = False
     """Compare all photographs with the points, not 150 at most, to find single wrong poses."""
-    json: bool = False
-    """Print one JSON object instead, for scripts."""
 
 
 @dataclass(frozen=True)
@@ -123,9 +122,6 @@ def run(arguments: list[str]) -> None:
         clock("read", 0.0)
         scene = _read(options)
         facts = _measure(options, scene, clock)
-    if options.json:
-        print(json.dumps(_json(scene, facts), indent=2, allow_nan=False), file=OUT.file)
-        return
     _show(options, scene, facts)
 
 
@@ -156,15 +152,21 @@ def _measure(options: Options, scene: Scene, clock: StageClock) -> _Facts:
     )  # fmt: skip
 
 
-def _json(scene: Scene, facts: _Facts) -> Any:
-    problems = [with_options(str(each)) for each in facts.problems]
-    own = {
-        "verdict": facts.verdict(scene), "checkup": facts.check.facts, "points": facts.cloud,
-        "tracks": facts.tracks, "empty": facts.regions, "poses": facts.check.poses,
-        "masks": facts.masks, "depth_map_statistics": facts.maps, "depth": facts.alignments,
-        "problems": problems, "findings": facts.problems,
-    }  # fmt: skip
-    return _plain({**_facts_of(scene), **own})
+def _add_results(scene: Scene, facts: _Facts, advice: Advice, planned: Planned) -> None:
+    """Add what ``--json`` prints."""
+    poses, first = facts.check.poses, facts.check.first
+    problems, reasons = (
+        [with_options(str(each)) for each in texts]
+        for texts in (facts.problems, () if first else advice.reasons)
+    )
+    add_results(
+        **_facts_of(scene), verdict=facts.verdict(scene), checkup=facts.check.facts,
+        points=facts.cloud, tracks=facts.tracks, empty=facts.regions,
+        poses=poses and poses.facts, masks=facts.masks, depth_map_statistics=facts.maps,
+        depth=facts.alignments, problems=problems, planned=planned.facts, reasons=reasons,
+        advice=first or advice.sentence, layout=advice.measured.layout,
+    )  # fmt: skip
+    add_findings(*facts.problems)
 
 
 def _show(options: Options, scene: Scene, facts: _Facts) -> None:
@@ -177,6 +179,7 @@ def _show(options: Options, scene: Scene, facts: _Facts) -> None:
     rows += [*check.rows, *_photograph_rows(facts.regions, check.poses, facts.masks)]
     if len(scene.points):
         rows += [("advice", check.first)] if check.first else _advice_rows(advice, planned)
+    _add_results(scene, facts, advice, planned)
     print_pairs(str(options.scene), rows)
     if facts.alignments is not None:
         _print_depth(str(options.depth), scene, facts.alignments)
@@ -189,7 +192,7 @@ def _show(options: Options, scene: Scene, facts: _Facts) -> None:
         commands = _next(options, usable, advice, planned, facts.known, check.poses)
         if check.first and len(scene.points):
             commands = [("once that is mended", f"splatseed info {quoted(options.scene)}")]
-        print_pairs("next", commands)
+        print_next(commands)
 
 
 def _shows_model(options: Options) -> bool:
@@ -206,7 +209,7 @@ def _shows_model(options: Options) -> bool:
     expected = "a scene, for options about depth and budgets"
     fix = "Drop these options, or name the scene."
     refuse((any(each is not None for each in given), expected, found, fix))
-    show_model(options.scene, as_json=options.json)
+    show_model(options.scene)
     return True
 
 
@@ -340,7 +343,7 @@ def _next(
 
 def _facts_of(scene: Scene) -> dict[str, Any]:
     """Return the source and the contents of a scene, for ``--json``."""
-    train, test = scene.split()
+    train, test = scene.split(scene.default_test_every)
     return {
         "format": scene.source.format,
         "root": str(scene.source.root),
@@ -357,22 +360,6 @@ def _facts_of(scene: Scene) -> dict[str, Any]:
     }
 
 
-def _plain(value: Any) -> Any:
-    """Convert a value for JSON: a dataclass to an object, a number that is not finite to null."""
-    if isinstance(value, PoseCheck):
-        value = value.facts
-    if is_dataclass(value) and not isinstance(value, type):
-        value = asdict(value)
-    if isinstance(value, Mapping):
-        return {str(key): _plain(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
-    if isinstance(value, float) or hasattr(value, "item"):
-        number = float(value)
-        return number if math.isfinite(number) else None
-    return value
-
-
 def _cameras(scene: Scene) -> list[Intrinsics]:
     """Return all cameras, in pixels of their photographs, in the order of their records."""
     used: dict[int, dict[Intrinsics, None]] = {}
@@ -386,7 +373,7 @@ def _source_rows(scene: Scene) -> list[tuple[str, str]]:
     cameras = [f"{count:,} {kind}" for kind, count in sizes.most_common(KINDS_SHOWN)]
     if len(sizes) > KINDS_SHOWN:
         cameras.append(f"{len(sizes) - KINDS_SHOWN:,} more kinds")
-    train, test = scene.split()
+    train, test = scene.split(scene.default_test_every)
     by = f", by its {scene.listed.origin}" if scene.listed else ""
     images = f"{len(scene.images):,} ({len(train):,} to train, {len(test):,} to test{by})"
     return [

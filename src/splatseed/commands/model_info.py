@@ -1,20 +1,18 @@
 """What ``splatseed info`` prints of trained Gaussians: a file, or the folder of a run.
 
-With ``--json``, positions and sizes are in scene units, five numbers are percentiles 5, 25, 50, 75
-and 95, and keys are only ever added.
+With ``--json``, positions and sizes are in scene units, and five numbers are percentiles 5, 25, 50,
+75 and 95.
 """
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from splatseed.console import OUT, print_note, print_pairs
+from splatseed.console import add_results, print_next, print_note, print_pairs
 from splatseed.findings import Finding
 from splatseed.io.files import read_bytes
 from splatseed.io.origin import format_offset, offset_beside
@@ -39,7 +37,7 @@ def is_model(path: Path) -> bool:
     return RunFolder(path).is_run or unpacked_model(path) is not None
 
 
-def show_model(path: Path, *, as_json: bool = False) -> None:
+def show_model(path: Path) -> None:
     """Print the count, the extent, and the sizes and opacities of a model's Gaussians."""
     file, findings = model_file(path), list[Finding]()
     gaussians = read_gaussians(file, findings.append)
@@ -50,11 +48,7 @@ def show_model(path: Path, *, as_json: bool = False) -> None:
     }
     offset = offset_beside(file)
     facts["offset"] = None if offset is None else offset.tolist()
-    if as_json:
-        facts["findings"] = [asdict(each) for each in findings]
-        facts["notes"] = [str(each) for each in findings]
-        print(json.dumps(facts, indent=2), file=OUT.file)
-        return
+    add_results(**facts, notes=[str(each) for each in findings])
     middle, whole = (
         "  to  ".join(" ".join(f"{x:.4g}" for x in corner) for corner in facts[name])
         for name in ("extent", "bounding_box")
@@ -80,7 +74,7 @@ def show_model(path: Path, *, as_json: bool = False) -> None:
     print_note(*findings)
     known = isinstance(config_of(path).get("scene"), str)
     scored = f"splatseed evaluate {quoted(path)}{'' if known else ' --scene SCENE'}"
-    print_pairs("next", [("look at it", f"splatseed view {quoted(path)}"), ("score it", scored)])
+    print_next([("look at it", f"splatseed view {quoted(path)}"), ("score it", scored)])
 
 
 def describe_gaussians(gaussians: Gaussians) -> dict[str, Any]:

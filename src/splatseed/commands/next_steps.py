@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from splatseed.console import print_note, print_pairs
+from splatseed.console import print_next, print_note
 from splatseed.depth.settings import PER_POINT
 from splatseed.findings import Finding
 from splatseed.io.downsampling import reduced_size
@@ -105,6 +105,12 @@ class Planned(NamedTuple):
         most = len(scene.points) + _most_seeds(images)
         traits = settings.traits
         return cls(number, rho, max_steps, traits, max_seeds, flags, trainer, seconds, most)
+
+    @property
+    def facts(self) -> dict[str, object]:
+        """What ``--json`` prints."""
+        plan = {"budget": self.budget, "max_steps": self.max_steps, "max_seeds": self.max_seeds}
+        return {**plan, "strategy": self.strategy.name, "trainer": self.trainer}
 
 
 def advice_commands(
@@ -269,7 +275,7 @@ def print_training(read_from: Path, scene: Scene, output: Path, layout: Layout) 
     known = lenses <= COMMON_LENSES
     if known:
         trainers = training_commands(output, layout, lenses)
-        print_pairs("train it with", trainers)
+        print_next(trainers, "train it with")
         if "graphdeco" in dict(trainers) and (off := off_centre(scene)) > CENTRED:
             text = (
                 f"graphdeco's trainer ignores principal points, which are up to {off:.1f} px off "

@@ -1,24 +1,33 @@
 """Parse a verb's options with tyro, which prints help, errors (exit code 2) and completions.
 
-What they name to write is checked before any work is done.
+What they name to write is checked and locked before any work is done. All verbs have the options of
+``console.Reporting``, after their own.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import logging
+import shlex
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import tyro
 
+from splatseed.console import Reporting, configure, hold, print_message
 from splatseed.errors import OutputError, ParameterError
-from splatseed.io.staging import check_parents, check_separate
+from splatseed.io.staging import check_parents, check_separate, reserved, translate_write_errors
+from splatseed.requirements import version_of
 
 Options = TypeVar("Options")
 
 CONFIG = (tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff)
 """Optional options take no None; a switch has no negated twin."""
+_REPORTING = "reporting"
+_WRITTEN = ("output", "renders", "gaussians", "picture")
+"""Options that name what is written."""
 
 
 def parse_options(
@@ -31,15 +40,48 @@ def parse_options(
 ) -> Options:
     """Parse ``arguments``, which follow the verb; ``default`` holds the values of other options.
 
+    From now on messages go where they ask for, and no other process may write what they name.
+
     Raises:
+        OutputError: The output is - or another process writes it, or the log cannot be written.
+        ParameterError: They exclude each other.
         SystemExit: They are wrong, which is printed unless ``quiet``, or ask for help.
     """
-    given: dict[str, Any] = {} if default is None else {"default": default}
-    options: Options = tyro.cli(
-        kind, prog=f"splatseed {verb}", args=list(arguments), config=CONFIG,
-        console_outputs=not quiet, **given,
+    full = with_reporting(kind)
+    given: dict[str, Any] = {} if default is None else {"default": full(**_fields(default))}
+    values = _fields(
+        tyro.cli(
+            full, prog=f"splatseed {verb}", args=list(arguments), config=CONFIG,
+            console_outputs=not quiet, **given,
+        )
     )  # fmt: skip
-    return options
+    reporting: Reporting = values.pop(_REPORTING)
+    both = reporting.quiet and reporting.verbose
+    refuse((both, "--quiet or --verbose", "both", "Leave one of them out."))
+    with translate_write_errors(reporting.log or Path()):
+        configure(reporting)
+    command = shlex.join(["splatseed", *verb.split(), *arguments])
+    print_message(f"splatseed {version_of('splatseed')}: {command}", logging.DEBUG)
+    for path in {values[name] for name in _WRITTEN if values.get(name) is not None}:
+        if str(path) == "-":
+            fix = "Name one; --json prints the results to stdout."
+            raise OutputError("the name of a file or folder to write", found="-", fix=fix)
+        if not values.get("dry_run"):
+            hold(reserved(path))
+    return kind(**values)
+
+
+def with_reporting(kind: type[Any]) -> type[Any]:
+    """Return a verb's options with those of ``Reporting``."""
+    field = dataclasses.field(default=Reporting())
+    own = (_REPORTING, Annotated[Reporting, tyro.conf.arg(name="")], field)
+    full = dataclasses.make_dataclass(kind.__name__, [own], bases=(kind,), frozen=True)
+    full.__doc__ = kind.__doc__
+    return full
+
+
+def _fields(options: Any) -> dict[str, Any]:
+    return {each.name: getattr(options, each.name) for each in dataclasses.fields(options)}
 
 
 def parse_some(kind: type[Options], arguments: Sequence[str]) -> Options:

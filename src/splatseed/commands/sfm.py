@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
@@ -14,13 +14,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from splatseed.commands.options import parse_options, refuse
-from splatseed.console import ERR, StageClock, print_note, print_pairs, stage_display
+from splatseed.console import (
+    StageClock,
+    add_results,
+    print_message,
+    print_next,
+    print_note,
+    print_pairs,
+    stage_display,
+)
 from splatseed.errors import SplatseedError
 from splatseed.findings import Finding
 from splatseed.io import load_scene
 from splatseed.io.files import is_video
 from splatseed.io.masks import masks_near
 from splatseed.io.staging import check_output
+from splatseed.requirements import require
 from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Masks, Scene
 from splatseed.sfm import MatcherName, Settings, SfmReport, reconstruct
@@ -55,8 +64,9 @@ class Options:
     or the pairs that a first look at few features finds to overlap (auto)."""
     frames: int = 150
     """Maximum frames from a video."""
-    camera_model: str = "OPENCV"
-    """COLMAP's camera model; not used with --poses-from."""
+    camera_model: str | None = None
+    """COLMAP's camera model; not used with --poses-from. By default OPENCV, and SIMPLE_PINHOLE,
+    which has no distortion, with fewer than 16 photographs."""
     shared_camera: bool = True
     """Photographs of the same size and EXIF lens share a camera; not used with --poses-from."""
     device: DeviceName = "auto"
@@ -96,6 +106,7 @@ def run(arguments: list[str]) -> None:
          "it with --poses-from, of which all are known", "Leave it out."),
         (known and video, f"{poses} with --poses-from", "a video", f"Name {poses}."),
     )  # fmt: skip
+    require("pycolmap", *["imageio_ffmpeg"] * video)
     with stage_display(remaining=True, lines=True) as clock:
         clock("prepare", 0.0)
         make = _from_video if video else _from_photographs
@@ -192,9 +203,9 @@ def _report_photographs(
     folders = Counter(str(PurePosixPath(name).parent) for name in names)
     shown = name_some([f"{count:,} in {folder}" for folder, count in folders.most_common()])
     where = "" if set(folders) == {"."} else f": {shown}"
-    ERR.print(visible(f"{counted(len(names), 'photograph')} in {images}{where}"), soft_wrap=True)
+    print_message(visible(f"{counted(len(names), 'photograph')} in {images}{where}"))
     if cameras:
-        ERR.print(cameras, soft_wrap=True)
+        print_message(cameras)
     skipped = [
         f"{counted(len(them), 'image')} {what} ({name_some(them, SHOWN)})"
         for what, them in left_out.items()
@@ -249,6 +260,8 @@ def _summarise(options: Options, report: SfmReport, error: PoseErrorEstimate | N
         ("output", str(report.path)),
     ]
     print_pairs("splatseed sfm", rows)
+    facts = {key: value for key, value in asdict(report).items() if key not in {"path", "poses"}}
+    add_results(output=report.path, pose_error=error, **facts)
     if 2 * report.registered < report.total:
         text = "This is a part of the scene: fewer than half of the photographs have a pose."
         print_note(Finding("partial-scene", text))
@@ -263,4 +276,4 @@ def _summarise(options: Options, report: SfmReport, error: PoseErrorEstimate | N
     if report.unregistered:
         text = f"without a pose: {name_some(report.unregistered)}"
         print_note(Finding("unregistered-images", text, subjects=tuple(report.unregistered)))
-    print_pairs("next", [("what suits it", f"splatseed info {quoted(options.output)}")])
+    print_next([("what suits it", f"splatseed info {quoted(options.output)}")])

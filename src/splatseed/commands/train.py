@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import sys
 import time
@@ -21,7 +22,15 @@ from rich import progress as rich_progress
 from rich.table import Column
 
 from splatseed.commands.options import parse_options, parse_some
-from splatseed.console import ERR, OUT, print_note, print_pairs, stage_display
+from splatseed.console import (
+    ERR,
+    add_results,
+    print_message,
+    print_next,
+    print_note,
+    print_pairs,
+    stage_display,
+)
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.findings import Finding
 from splatseed.io import load_scene
@@ -153,7 +162,12 @@ def _read_config(path: Path, words: Collection[str]) -> dict[str, Any]:
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse(arguments)
-    require("torch", "gsplat", "flip_evaluator", *(["viser"] if options.view else []))
+    require(
+        "torch", "gsplat", "flip_evaluator",
+        *["viser"] * options.view,
+        *["pycolmap"] * options.request.refine_poses,
+        *["tensorboard"] * options.request.tensorboard,
+    )  # fmt: skip
     from splatseed.splat.evaluate import evaluate_views
     from splatseed.training.api import prepare_training
 
@@ -182,7 +196,7 @@ def run(arguments: list[str]) -> None:
     if not done and not (viewer and viewer.kept):
         again = f"{quoted(options.scene)} -o {quoted(options.output)} --resume"
         saved = f"interrupted after step {training.state.step:,}; saved. Continue with:"
-        ERR.print(f"\n{saved}\n  splatseed train {again}", soft_wrap=True)
+        print_message(f"\n{saved}\n  splatseed train {again}", logging.WARNING)
         sys.exit(exit_code())
     with stage_display(clock):
         result = training.finish(partial(evaluate_views, progress=clock), clock)
@@ -196,13 +210,13 @@ def _announce(options: Options, training: TrainingRun) -> None:
         print_note(Finding("unused-setting", text))
     chosen = settings.strategy == DEFAULTS.strategy
     strategy = f"{settings.traits.name} ({settings.strategy})" if chosen else settings.strategy
-    OUT.print(
-        f"{visible(options.scene)} ({len(views)} training and {len(training.trainer.test_views)} "
-        f"test views of {views[0].width} x {views[0].height}, "
+    tests = len(training.trainer.test_views)
+    parts = f"{len(views)} training and {tests} test views" if tests else f"{len(views)} views"
+    print_message(
+        f"{visible(options.scene)} ({parts} of {views[0].width} x {views[0].height}, "
         f"{len(training.state.params['means']):,} Gaussians)\n  -> strategy {strategy}, "
         f"{settings.max_steps:,} steps, seed {settings.seed}, on {training.device}\n  -> "
-        f"{visible(options.output)}",
-        soft_wrap=True,
+        f"{visible(options.output)}"
     )
 
 
@@ -222,8 +236,7 @@ def _watched(options: Options, training: TrainingRun) -> Iterator[TrainingViewer
         port = free_port(HOST, 0)
     name = options.scene.name or str(options.scene)
     viewer = TrainingViewer(training, scene, name, HOST, port)
-    OUT.print(f"  -> watch it at http://localhost:{port}")
-    OUT.file.flush()
+    print_message(f"  -> watch it at http://localhost:{port}")
     try:
         yield viewer
     finally:
@@ -259,7 +272,6 @@ class _TimeLeft:
         if not self._is_printed and elapsed > REPORT_AFTER:
             self._is_printed = True
             print_note(*self._findings(now, self.seconds))
-            OUT.file.flush()
 
     @property
     def text(self) -> str:
@@ -329,28 +341,33 @@ def _summarise(options: Options, training: TrainingRun, result: TrainingResult) 
     scores, seconds, output = result.scores, result.train_seconds, options.output
     exposed = training.settings.exposure != "none"
     psnr = f"{scores.psnr:.2f} dB" if math.isfinite(scores.psnr) else "infinite"
-    rows = [
+    scored = [
         ("test PSNR", psnr),
         *[("colour-corrected", f"{scores.cc_psnr or 0.0:.2f} dB")] * exposed,
         ("test SSIM, FLIP", f"{scores.ssim:.4f}, {scores.flip or 0.0:.4f}"),
+    ]
+    pictures = [str(output / "renders")] if scores.per_image else []
+    rows = [
+        *(scored if scores.per_image else [("score", "none, as no photograph was held out")]),
         ("Gaussians", f"{scores.num_gaussians:,} from {result.num_seeds:,} seeds"),
         ("training", f"{seconds:.1f} s for {result.steps:,} steps"),
         ("Gaussians in", str(training.folder.gaussians)),
-        ("pictures", f"{output / 'renders'}, {output / 'curve.png'}"),
+        ("pictures", ", ".join([*pictures, str(output / "curve.png")])),
     ]
     print_pairs("splatseed train", rows)
+    add_results(output=output, gaussians=training.folder.gaussians, **result.to_dict())
     if held := result.held_by_memory_at:
         text = f"memory limited the run to {held:,} Gaussians; results may vary between machines."
         fix = f"Pass --budget {held} for the same result everywhere."
         print_note(Finding("memory-limit", text, fix=fix))
-    print_pairs("next", _next_commands(output))
+    print_next(_next_commands(output, scored=bool(scores.per_image)))
 
 
-def _next_commands(output: Path) -> list[tuple[str, str]]:
+def _next_commands(output: Path, *, scored: bool) -> list[tuple[str, str]]:
     """Return the commands for a finished run; LPIPS only where its weights are."""
     from splatseed.splat.lpips import has_lpips_weights
 
     view = ("look at it", f"splatseed view {quoted(output)}")
     share = ("share it", f"splatseed export {quoted(output)} -o {quoted(f'{output}.html')}")
     score = ("score again, with LPIPS", f"splatseed evaluate {quoted(output)}")
-    return [view, share, *[score] * has_lpips_weights()]
+    return [view, share, *[score] * (scored and has_lpips_weights())]

@@ -10,13 +10,14 @@ from typing import Annotated
 import tyro
 
 from splatseed.commands.options import parse_options
-from splatseed.console import print_note, print_pairs, stage_display
+from splatseed.console import add_results, print_next, print_note, print_pairs, stage_display
 from splatseed.findings import Finding, without_kinds
 from splatseed.io import load_scene
 from splatseed.io.depth_maps import DepthFiles
 from splatseed.io.load import depths_beside
 from splatseed.io.seeds import was_upsampled
 from splatseed.io.staging import check_output
+from splatseed.requirements import require
 from splatseed.seeding.advice import is_distorted
 from splatseed.sfm import undistort
 from splatseed.text import agreeing, counted, quoted
@@ -38,6 +39,7 @@ def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse_options(Options, "undistort", arguments)
     output, overwrite = options.output, options.overwrite
+    require("pycolmap")
     check_output(output, kind="undistort", overwrite=overwrite, protect=[options.scene])
     with stage_display(lines=True) as clock:
         clock("read", 0.0)
@@ -46,6 +48,7 @@ def run(arguments: list[str]) -> None:
         report = undistort(scene, output, overwrite=overwrite, on_progress=clock)
     counts = [("images", f"{report.registered:,}"), ("points", f"{report.num_points:,}")]
     print_pairs("splatseed undistort", [*counts, ("output", str(output))])
+    add_results(output=output, images=report.registered, points=report.num_points)
     print_note(*without_kinds(scene.findings, "lens-distortion"))
     maps = scene.depths or depths_beside(scene)
     if isinstance(maps, DepthFiles) and maps:
@@ -57,4 +60,4 @@ def run(arguments: list[str]) -> None:
         text = "No camera had distortion: the photographs are copies."
         print_note(Finding("no-distortion", text, "info"))
     verb, made = ("train", "RUN") if was_upsampled(scene) else ("upsample", "OUT")
-    print_pairs("next", [("", f"splatseed {verb} {quoted(output)} -o {made}")])
+    print_next([("", f"splatseed {verb} {quoted(output)} -o {made}")])

@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from splatseed.commands.options import parse_options, refuse
-from splatseed.console import OUT, print_note, print_pairs, stage_display
+from splatseed.console import (
+    add_results,
+    print_message,
+    print_next,
+    print_note,
+    print_pairs,
+    print_report,
+    stage_display,
+)
 from splatseed.findings import Finding
 from splatseed.io.load import check_exists, is_scene
 from splatseed.requirements import require
@@ -78,7 +86,7 @@ def run(arguments: list[str]) -> None:
         while True:
             time.sleep(3600)
     except KeyboardInterrupt as stop:
-        OUT.print("stopped")
+        print_message("stopped")
         if isinstance(stop, Termination):  # Ctrl-C is the usual end
             sys.exit(exit_code(stop))
     finally:
@@ -132,9 +140,11 @@ def _announce(options: Options, port: int, items: list[ViewerItem], second: int 
         rows.append(("side by side", f"{items[0].name} left, {items[second].name} right"))
     print_pairs("splatseed view", rows)
     print_note(*(finding for item in items for finding in item.findings))
-    commands = [("open in a browser", f"http://{host}:{port}")]
+    url = f"http://{host}:{port}"
+    add_results(url=url, items=[name for name, _ in rows[: len(items)]])
+    commands = [("open in a browser", url)]
     if options.host in LOCAL:
         tunnel = f"ssh -L {port}:localhost:{port} {socket.gethostname()}"
         commands.append(("from elsewhere, first", tunnel))
-    print_pairs("next", [*commands, ("stop", "Ctrl-C")])
-    OUT.file.flush()
+    print_next([*commands, ("stop", "Ctrl-C")])
+    print_report()

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock, Timeout
 
 from splatseed.errors import OutputError, SplatseedError
 from splatseed.io.files import read_text
@@ -39,7 +40,7 @@ _MIN_LEFTOVER_AGE = 5.0
 """Age in seconds from which an unlocked partial is a leftover; new ones are locked at once."""
 _IGNORED = re.compile(
     r"preview(_methods|_maps|_cells|_origins)?\.png"  # written by splatseed after the manifest
-    r"|(.*/)?(\.DS_Store|Thumbs\.db|\.[^/]+\.partial-[0-9a-f]{8}(\.\w+|/.*)?"
+    r"|(.*/)?(\.DS_Store|Thumbs\.db|\.[^/]+\.lock|\.[^/]+\.partial-[0-9a-f]{8}(\.\w+|/.*)?"
     r"|images_\d+_png/.*\.png)",  # gsplat's copies of the photographs
     re.IGNORECASE,
 )
@@ -89,6 +90,42 @@ def atomic_file(path: Path) -> Iterator[Path]:
         raise OutputError(f"a file name at {target}", found=other, fix="Choose another name.")
     with staged(target, folder=False) as partial:
         yield partial
+
+
+@contextmanager
+def reserved(path: Path) -> Iterator[None]:
+    """Hold an output while the block runs, against other processes and threads that hold it, too.
+
+    The lock is the system's, on a hidden ``.NAME.lock`` beside the output: it ends with the process
+    however that ends, and a file that a kill leaves is no lock. Where there are no locks, or no
+    file can be made, nothing is held.
+
+    Raises:
+        OutputError: Another one holds it.
+    """
+    target = _resolved(path)
+    lock = FileLock(target.with_name(f".{target.name}.lock"))
+    made = not target.parent.exists()
+    try:
+        with suppress(OSError, NotImplementedError):
+            target.parent.mkdir(exist_ok=True)
+            try:
+                lock.acquire(timeout=0)
+            except Timeout:
+                raise OutputError(
+                    f"no other process that writes {target}",
+                    found="one",
+                    fix="Wait until it ends, stop it, or choose another name.",
+                ) from None
+        yield
+    finally:
+        with suppress(OSError):
+            if lock.is_locked:  # removed before it is released, so that nobody else's is removed
+                Path(lock.lock_file).unlink()  # Windows does so on release
+        lock.release()
+        with suppress(OSError):
+            if made:
+                target.parent.rmdir()  # if nothing was written
 
 
 def write_json(path: Path, content: Mapping[str, object]) -> None:

@@ -12,11 +12,15 @@ from splatseed.methods.add_points import (
 )
 from splatseed.methods.contract import Made, Traits, Upsampler, traits_of
 from splatseed.methods.registry import (
+    BUILT_IN,
     METHODS,
+    OWN_METHOD,
     SOURCE_CODES,
     Profile,
+    absolute_place,
     chooses_number,
     configure,
+    method_label,
     methods_for,
     resolve,
     source_code,
@@ -24,17 +28,21 @@ from splatseed.methods.registry import (
 )
 
 __all__ = [
+    "BUILT_IN",
     "DEFAULT_RATIO",
     "METHODS",
+    "OWN_METHOD",
     "SOURCE_CODES",
     "Made",
     "Profile",
     "Traits",
     "Upsampler",
+    "absolute_place",
     "add_points",
     "check_seed",
     "chooses_number",
     "configure",
+    "method_label",
     "methods_for",
     "number_of_new",
     "planned_size",

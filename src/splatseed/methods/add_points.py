@@ -6,17 +6,19 @@ number of threads; new points are finite.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import sys
+import traceback
+from collections.abc import Callable, Mapping
 from inspect import signature
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from splatseed.errors import ParameterError, PointCloudError
+from splatseed.errors import ParameterError, PointCloudError, SplatseedError
 from splatseed.methods.contract import Made, Upsampler, nothing_finite, traits_of
-from splatseed.methods.registry import chooses_number, source_code
-from splatseed.pointcloud import ORIGINAL, PointCloud
+from splatseed.methods.registry import chooses_number, plugin_fault, source_code
+from splatseed.pointcloud import GENERATED, ORIGINAL, PointCloud
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.runtime.memory import check_memory
 from splatseed.scene import Scene
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
 DEFAULT_RATIO = 4.0
 BYTES_EACH = 200  # memory per point while it is made and written; measured as 125 at 1 to 3 million
 MAX_POINTS = 1 << 32  # a request for more points than this is a typo
+_FIX = 'Correct the method (docs/methods.md, "Your own method").'
 
 
 def add_points(
@@ -52,11 +55,34 @@ def add_points(
         return originals
     if "points" in traits_of(method).needs and not originals.finite.any():
         raise nothing_finite(len(originals))
-    call: Any = method  # with parameters beyond the contract's
     offered = {"note": note, "budget": budget, "on_stereo": on_stereo}
-    taken = {key: offered[key] for key in offered if key in signature(call).parameters}
-    made = call(scene, num_new or 0, np.random.default_rng(seed), progress, **taken)
-    return PointCloud.concatenate(originals, _as_cloud(made, num_new, source_code(name)))
+    made = _call(
+        name, method, (scene, num_new or 0, np.random.default_rng(seed), progress), offered
+    )
+    code = source_code(name) if _is_built_in(method) else GENERATED
+    new = _as_cloud(name, made, num_new, len(originals), code)
+    return PointCloud.concatenate(originals, new)
+
+
+def _call(name: str, method: Any, arguments: tuple[Any, ...], offered: Mapping[str, Any]) -> Made:
+    """Call a method, with those of the parameters ``offered`` that it has.
+
+    An error of another package's method names the method and the line in its file.
+    """
+    try:
+        parameters = signature(method).parameters
+        made: Made = method(*arguments, **{k: v for k, v in offered.items() if k in parameters})
+    except Exception as error:
+        if _is_built_in(method) or isinstance(error, MemoryError):
+            raise
+        if not isinstance(error, SplatseedError):
+            raise plugin_fault(method, name, error) from error
+        file = getattr(sys.modules.get(getattr(method, "__module__", "")), "__file__", None)
+        lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == file]
+        where = f", line {lines[-1]} of {file}" if lines else ""
+        expected = f"{error.expected}, in method {name!r}{where}"
+        raise type(error)(expected, found=error.found, fix=error.fix) from error
+    return made
 
 
 def number_of_new(
@@ -133,19 +159,48 @@ def planned_size(num_original: int, ratio: float | None, num_points: int | None)
     return num_points
 
 
-def _as_cloud(made: Made, num_new: int | None, code: int) -> PointCloud:
+def _is_built_in(method: Upsampler) -> bool:
+    return getattr(method, "__module__", "").partition(".")[0] == "splatseed"
+
+
+def _as_cloud(
+    name: str, made: Made, num_new: int | None, num_original: int, code: int
+) -> PointCloud:
     """Check the points that a method returned; ``num_new`` is None if it chose their number."""
-    points = made if isinstance(made, PointCloud) else PointCloud(*made)
+    number, by = "M" if num_new is None else f"{num_new}", f"from method {name!r}"
+    expected = (
+        f"a PointCloud of {number} new points, or a tuple of their positions [{number}, 3] and "
+        f"colours uint8 [{number}, 3], {by}"
+    )
+    points = made
+    if not isinstance(points, PointCloud):
+        if not isinstance(made, tuple | list):
+            raise PointCloudError(expected, found=_describe(made), fix=_FIX)
+        try:
+            points = PointCloud(*made)
+        except (SplatseedError, TypeError, ValueError) as error:
+            raise PointCloudError(expected, found=_describe(made), fix=_FIX) from error
     if num_new is not None and len(points) != num_new:
-        raise PointCloudError(
-            f"{num_new:,} new points", found=f"{len(points):,}", fix="Report this to its author."
-        )
+        more = len(points) == num_new + num_original
+        fix = f"{'Return the new points only, without the originals. ' * more}{_FIX}"
+        raise PointCloudError(expected, found=_describe(made), fix=fix)
     if not np.isfinite(points.xyz).all():
         bad = int(np.flatnonzero(~np.isfinite(points.xyz).all(axis=1))[0])
         raise PointCloudError(
-            "finite new points",
+            f"finite new points {by}",
             found=f"{points.xyz[bad].tolist()} at new point {bad}",
-            fix="Report this with the scene; float32 may be too small for its coordinates.",
+            fix=f"{_FIX} Or float32 is too small for the coordinates of the scene.",
         )
     source = np.where(points.source == ORIGINAL, np.uint8(code), points.source)
     return points.replace(source=source, original_idx=None)
+
+
+def _describe(made: Any) -> str:
+    """Describe what a method returned: types, and shapes of arrays."""
+    if isinstance(made, tuple):
+        return f"a tuple of {', '.join(map(_describe, made[:4]))}{', ...' * (len(made) > 4)}"
+    if isinstance(made, PointCloud):
+        return f"a PointCloud of {len(made)}"
+    if hasattr(made, "shape") and hasattr(made, "dtype"):
+        return f"{made.dtype} {list(made.shape)}"
+    return "None" if made is None else f"a {type(made).__name__}"

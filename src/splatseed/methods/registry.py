@@ -1,28 +1,47 @@
 """METHODS: all upsampling methods by name, and their configuration.
 
 Built-in methods come first, then those that installed packages register under the entry-point group
-``splatseed.methods`` (``name = "package.module:Class"``). A class is imported when it is first
-looked up. No package can replace a built-in method.
+``splatseed.methods`` (``name = "package.module:Class"``), which cannot replace them. Any other name
+with a colon is a place: ``my_method.py:Jitter`` or ``package.module:Jitter``. A place may hold a
+class, a configured method or a plain function. It is imported when it is first looked up.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Mapping
-from functools import cached_property
+from functools import cache, cached_property
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
-from types import MappingProxyType
-from typing import Any, Literal, cast
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import MappingProxyType, ModuleType
+from typing import Any, Literal, TypeVar, cast
 
-from splatseed.errors import MissingDependencyError, ParameterError, UnknownNameError
+from splatseed.errors import (
+    MissingDependencyError,
+    ParameterError,
+    PluginError,
+    SplatseedError,
+    UnknownNameError,
+)
 from splatseed.methods.contract import Need, Upsampler, traits_of
 from splatseed.pointcloud import GENERATED, ORIGINAL, PointCloud
 from splatseed.requirements import pip_command
+from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Scene
 from splatseed.settings import change_settings
-from splatseed.text import did_you_mean
+from splatseed.text import describe_exception, did_you_mean
+
+E = TypeVar("E", bound=SplatseedError)
 
 GROUP = "splatseed.methods"
+OWN_METHOD = (
+    "A method of your own is FILE.py:NAME, or known by name once a package that registers it as an "
+    f'entry point in group {GROUP} is installed (docs/methods.md, "Your own method"): '
+    f"{pip_command('install', '-e', 'FOLDER')}."
+)
+"""Advice for an unknown name."""
 
 BUILT_IN = {
     "linear": "splatseed.methods.elementary:Linear",
@@ -50,32 +69,25 @@ class MethodRegistry(Mapping[str, type[Upsampler]]):
         if name in BUILT_IN:
             module, _, attribute = BUILT_IN[name].partition(":")
             return cast("type[Upsampler]", getattr(import_module(module), attribute))
-        if name in self._plugins:
-            return self._load(name)
+        if (entry := self.entry(name)) is not None:
+            return _load(entry)
         choose = did_you_mean(str(name), self).strip() or "Choose one of these."
         raise UnknownNameError(
-            f"one of the methods {', '.join(self)}",
-            found=repr(name),
-            fix=f"{choose} A method of your own is known by name once a package that registers it "
-            f"as an entry point in group {GROUP} is installed (docs/methods.md, "
-            f'"Your own method"): {pip_command("install", "-e", "FOLDER")}.',
+            f"one of the methods {', '.join(self)}", found=repr(name), fix=f"{choose} {OWN_METHOD}"
         )
 
-    def _load(self, name: str) -> type[Upsampler]:
-        entry = self._plugins[name]
-        try:
-            return cast("type[Upsampler]", entry.load())
-        except Exception as error:  # another's code may raise anything
-            package = entry.dist.name if entry.dist else entry.value
-            raise MissingDependencyError(
-                f"method {name!r}, {entry.value} of the package {package}, to be imported",
-                found=f"{type(error).__name__}: {error}",
-                fix="Correct the package and install it again, or do without: "
-                f"{pip_command('uninstall', package)}.",
-            ) from error
+    def entry(self, name: str) -> EntryPoint | None:
+        """Return where a method of another package, or at a place, comes from; else None."""
+        if name in self._plugins or ":" not in str(name):
+            return self._plugins.get(name)
+        return EntryPoint(name, name, GROUP)
+
+    def registered(self, value: str) -> EntryPoint | None:
+        """Return the entry point of another package's method at ``value``, MODULE:CLASS."""
+        return next((each for each in self._plugins.values() if each.value == value), None)
 
     def __contains__(self, name: object) -> bool:
-        return name in BUILT_IN or name in self._plugins
+        return name in BUILT_IN or self.entry(str(name)) is not None
 
     def __repr__(self) -> str:
         return f"METHODS({', '.join(self)})"
@@ -95,6 +107,73 @@ class MethodRegistry(Mapping[str, type[Upsampler]]):
 
 
 METHODS = MethodRegistry()
+
+
+def _load(entry: EntryPoint) -> type[Upsampler]:
+    """Import a method; one that needs no call to be configured is wrapped as if it were a class."""
+    file, _, name = entry.value.rpartition(":")
+    try:
+        if file.endswith(".py"):
+            path = Path(file).resolve()
+            found = getattr(_import_file(path, path.read_bytes()), name)
+        else:
+            found = entry.load()
+        if not callable(found):
+            raise TypeError(f"{name} is {found!r}, which cannot be called")  # noqa: TRY301
+    except Exception as error:  # another's code may raise anything
+        raise _fault(MissingDependencyError, entry, "to be imported", error) from error
+    return cast("type[Upsampler]", found if isinstance(found, type) else lambda: found)
+
+
+def plugin_fault(method: Any, name: str, error: Exception) -> PluginError:
+    """Return the error that names the package, or the file, of a method that raised another."""
+    value = f"{getattr(method, '__module__', '')}:{type(method).__qualname__}"
+    return _fault(
+        PluginError,
+        METHODS.registered(value) or EntryPoint(name, name, GROUP),
+        "without an exception",
+        error,
+    )
+
+
+def _fault(kind: type[E], entry: EntryPoint, task: str, error: Exception) -> E:
+    expected, fix = f"method {entry.name!r}", "Correct it, or its name."
+    if entry.name != entry.value:  # it is registered
+        package = entry.dist.name if entry.dist else entry.value
+        expected += f", {entry.value} of the package {package},"
+        fix = "Correct the package and install it again, or do without: "
+        fix += f"{pip_command('uninstall', package)}."
+    return kind(f"{expected} {task}", found=describe_exception(error), fix=fix)
+
+
+@cache
+def _import_file(path: Path, content: bytes) -> ModuleType:
+    """Import a file once per content; it may import what lies beside it, as a script may."""
+    # Two files of one name are two modules, and none replaces an installed one.
+    name = f"{path.stem}_{fingerprint(str(path), content)[:8]}"
+    spec = spec_from_file_location(name, path)
+    assert spec is not None and spec.loader is not None  # noqa: S101, PT018  (it ends with .py)
+    sys.path.insert(0, str(path.parent))
+    sys.modules[name] = module = module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        sys.path.remove(str(path.parent))
+        raise
+    return module
+
+
+def absolute_place(name: str, folder: Path) -> str:
+    """Return the name of a method in a file with the file's absolute path; others unchanged."""
+    file, _, attribute = name.rpartition(":")
+    return f"{(folder / file).resolve()}:{attribute}" if file.endswith(".py") else name
+
+
+def method_label(name: str) -> str:
+    """Return the name of a method without the folder of its file."""
+    file, _, attribute = name.rpartition(":")
+    return f"{Path(file).name}:{attribute}" if file.endswith(".py") else name
 
 
 def source_code(name: str) -> int:
@@ -118,7 +197,7 @@ def configure(method: str, profile: Profile = "default", **parameters: Any) -> U
     """Make a method with its parameters.
 
     Args:
-        method: A key of ``METHODS``.
+        method: A key of ``METHODS``, or a place.
         profile: "default" for the best parameters, "paper" for those of the paper's text.
         parameters: Fields of the method that differ from the profile's.
 
@@ -134,7 +213,20 @@ def configure(method: str, profile: Profile = "default", **parameters: Any) -> U
         raise ParameterError(
             "the profile 'default' or 'paper'", found=repr(profile), fix="Choose one of these."
         )
-    chosen: Any = getattr(kind, "paper", kind)() if profile == "paper" else kind()
+    make = getattr(kind, "paper", kind) if profile == "paper" else kind
+    try:
+        chosen: Any = make()
+    except TypeError as error:  # of another package's class
+        raise ParameterError(
+            f"a default for every parameter of method {method!r}",
+            found=f"{error}",
+            fix='Give its fields defaults (docs/methods.md, "Your own method").',
+        ) from error
+    except SplatseedError:
+        raise
+    except Exception as error:
+        entry = METHODS.entry(method) or EntryPoint(method, method, GROUP)
+        raise _fault(PluginError, entry, "without an exception", error) from error
     configured: Upsampler = change_settings(chosen, method, parameters)
     return configured
 
@@ -153,7 +245,8 @@ def resolve(
             found=", ".join(extra),
             fix="Give the method by name, or set its fields with dataclasses.replace.",
         )
-    return getattr(method, "name", type(method).__name__), method
+    own = getattr(method, "__name__", type(method).__name__)  # of a function, or of a class
+    return getattr(method, "name", own), method
 
 
 def chooses_number(method: str | Upsampler) -> bool:

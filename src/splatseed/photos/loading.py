@@ -56,16 +56,18 @@ def load_split(
 ) -> tuple[tuple[View, ...], tuple[View, ...]]:
     """Load the training and the test views of a scene (``Scene.split``), each sorted by name.
 
-    The other arguments are those of ``load_views``.
+    There are no test views with ``test_every`` 0. The other arguments are those of ``load_views``.
 
     Raises:
         SceneNotFoundError: Images are missing, or too few.
         SceneFormatError: A camera has distortion, or an image cannot be used.
     """
     train, test = scene.split(test_every)
-    if not train or not test:
+    tests = test_every != 0 or scene.listed is not None
+    if not train or (not test if tests else len(train) < 2):
+        parts = ", one to train on and one to test" if tests else ""
         raise SceneNotFoundError(
-            "at least two images with a pose, one to train on and one to test",
+            f"at least two images with a pose{parts}",
             found=f"{len(scene.images)}",
             fix="Name a scene with more photographs.",
         )

@@ -20,7 +20,7 @@ from contextlib import suppress
 from typing import IO, Any, TypeAlias, cast
 
 from splatseed.errors import SplatseedError, TaskLostError
-from splatseed.progress import Progress, silent, thread_limit
+from splatseed.progress import Progress, silent
 
 Function: TypeAlias = Callable[..., Any]
 _PROGRAM = "from splatseed.runtime.child import serve; serve()"
@@ -107,8 +107,6 @@ def serve() -> None:
     """Be the child: make the call that the parent sent, reply, and exit."""
     replies = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what libraries print goes to the log
-    if "NUMBA_NUM_THREADS" in os.environ:
-        thread_limit.set(int(os.environ["NUMBA_NUM_THREADS"]))
     reported = ("", 0.0)
 
     def reply(*message: object) -> None:
@@ -128,7 +126,7 @@ def serve() -> None:
         try:
             reply("value", function(*arguments, **({"progress": progress} if reports else {})))
         except Exception as error:  # noqa: BLE001  (the parent handles it)
-            if not isinstance(error, SplatseedError):
+            if not isinstance(error, SplatseedError) or error.__cause__:  # of another's code
                 error.add_note(traceback.format_exc())
             reply("error", error)
     except BaseException:  # noqa: BLE001  (the process ends here)

@@ -128,7 +128,7 @@ def advise(
     share = measured.num_points / measured.pixels if measured.pixels else 0.0
     shown = f"{share:.2f}" if share >= 0.01 or not share else f"{share:.1g}"
     size = f" of a photograph's {measured.pixels:,.0f}" if measured.pixels else ""
-    per_pixel = f"{measured.num_points:,} points, {shown} per pixel{size}"
+    per_pixel = f"{measured.num_points:,} distinct points, {shown} per pixel{size}"
     bare = ""
     if measured.empty is not None:
         bare = f"No point falls in {measured.empty:.0%} of the cells of a coarse grid over the "

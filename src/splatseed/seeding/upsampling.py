@@ -16,7 +16,7 @@ from splatseed.errors import ParameterError
 from splatseed.findings import Finding
 from splatseed.methods import Profile, Upsampler, add_points, check_seed, resolve, traits_of
 from splatseed.pointcloud import ORIGINAL, PointCloud
-from splatseed.progress import Note, Progress, silent, silent_note
+from splatseed.progress import Note, Progress, log_note, silent, silent_note
 from splatseed.scene import Scene
 from splatseed.seeding.advice import DEFAULT_METHOD, method_for
 from splatseed.seeding.budget import points_within
@@ -54,7 +54,7 @@ def upsample(
     profile: Profile = "default",
     unfit_points: UnfitPoints = "drop",
     progress: Progress = silent,
-    note: Note = silent_note,
+    note: Note = log_note,
     on_stereo: Callable[[StereoResult], None] | None = None,
     **parameters: Any,
 ) -> PointCloud:
@@ -66,8 +66,9 @@ def upsample(
         scene: A scene or a cloud. New points start from originals (``source`` 0) and replace all
             points that were added before, which a note counts: add points of your own to the
             result.
-        method: A key of ``METHODS``, or a configured method. "auto" compares the photographs;
-            without photographs "mls" replaces it, with a note.
+        method: A key of ``METHODS``, a place such as "my_method.py:Jitter", or a configured method
+            or function. "auto" compares the photographs; without photographs "mls" replaces it,
+            with a note.
         ratio: Points in all, as a multiple of the originals, for methods that interpolate; 4 if
             neither it nor ``num_points`` is given. "auto", "stereo" and "cover" choose the number
             themselves and accept neither.
@@ -83,8 +84,9 @@ def upsample(
         unfit_points: What to do with points that photographs contradict: "drop" them, "move" them
             by the similarity that fits, or "keep" them, as methods that interpolate always do.
         progress: Called with the stage and the fraction done.
-        note: Called with a ``Finding`` for each thing that was chosen, replaced or left out. Before
-            photographs are compared again, ``second-comparison`` gives its time and memory.
+        note: Called with a ``Finding`` for each thing that was chosen, replaced or left out; by
+            default they are logged. Before photographs are compared again, ``second-comparison``
+            gives its time and memory.
         on_stereo: Called with stereo's depth maps and views if the method compares photographs and
             the budget leaves room for new points.
         parameters: Fields of the method, such as ``k=12``.

@@ -105,6 +105,7 @@ class ColmapRun:
     work: Path  # a scratch folder, removed at the end
     on_progress: Progress
     kept: WorkFolder | None = None  # keeps features, matches and models after a failure
+    holds_focal: bool = False  # keep the focal lengths that mapping starts from
     seconds: dict[str, float] = field(default_factory=dict)  # wall time of finished stages
 
     @property

@@ -151,6 +151,7 @@ def _map(
     options = mapping_options(run)
     options.ba_global_frames_ratio = options.ba_global_points_ratio = _GROWTH
     options.ba_global_function_tolerance = options.ba_local_function_tolerance = _TOLERANCE
+    options.ba_refine_focal_length = not run.holds_focal
     if run.kept is not None:
         options.snapshot_path = run.kept.folder / MODELS / _SNAPSHOTS
         options.snapshot_path.mkdir(exist_ok=True)
@@ -243,6 +244,7 @@ def _map_at_once(run: ColmapRun, folder: Path, total: int) -> tuple[Path, Any] |
     options = pycolmap.GlobalPipelineOptions(
         num_threads=settings.threads, random_seed=settings.seed
     )
+    options.mapper.bundle_adjustment.refine_focal_length = not run.holds_focal
     try:
         models = run.stage(
             "global mapping",

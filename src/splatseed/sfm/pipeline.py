@@ -41,7 +41,16 @@ from splatseed.requirements import require, version_of
 from splatseed.runtime.child import Child
 from splatseed.scene import Image, LeftOut, Masks, Scene
 from splatseed.sfm import colmap
-from splatseed.sfm.cameras import Photos, SharedCamera, describe_cameras, share_cameras
+from splatseed.sfm.cameras import (
+    MIN_DISTORTION,
+    MIN_FOCAL,
+    Photos,
+    SharedCamera,
+    default_model,
+    describe_cameras,
+    held_lens,
+    share_cameras,
+)
 from splatseed.sfm.colmap import ColmapRun, Settings
 from splatseed.sfm.export import drop_repeats, export_scene
 from splatseed.sfm.mapping import map_images
@@ -72,7 +81,7 @@ class SfmReport:
     refinement: Refinement | None = None  # None without ``refine_poses``
     poses: tuple[Image, ...] = ()  # the known poses, refined with ``refine_poses``
     num_pairs: int = 0  # matched pairs of photographs
-    findings: tuple[Finding, ...] = ()  # poses that may be wrong, or were not refined
+    findings: tuple[Finding, ...] = ()  # a lens held, poses that may be wrong or were not refined
 
 
 Job: TypeAlias = Callable[..., Any]
@@ -84,7 +93,7 @@ def reconstruct(
     output: StrPath,
     settings: Settings = _DEFAULT,
     *,
-    camera_model: str = "OPENCV",
+    camera_model: str | None = None,
     shared_camera: bool = True,
     poses_from: Scene | None = None,
     refine_poses: bool = False,
@@ -110,7 +119,9 @@ def reconstruct(
         output: The scene folder to write, with the undistorted photographs that have a pose, at
             the input's size.
         settings: Settings of features, matching and reconstruction.
-        camera_model: COLMAP's camera model, if poses are not known.
+        camera_model: COLMAP's camera model, if poses are not known. By default OPENCV; for few
+            photographs SIMPLE_PINHOLE, and for very few with the focal length of EXIF, if there is
+            one (``sfm.cameras``), as they would fit distortion to noise.
         shared_camera: One camera per lens (``share_cameras``), or one per photograph, if poses are
             not known.
         poses_from: A scene with poses and intrinsics; its points are ignored.
@@ -138,7 +149,8 @@ def reconstruct(
             failed.
         MissingDependencyError: pycolmap is not installed, or cannot use the device.
     """
-    colmap.check_choice("camera_model", camera_model, tuple(CAMERA_MODELS))
+    if camera_model is not None:
+        colmap.check_choice("camera_model", camera_model, tuple(CAMERA_MODELS))
     require("pycolmap")
     images = Path(image_dir).absolute()
     photos, left_out = find_photos(images)
@@ -152,13 +164,13 @@ def reconstruct(
             on_photos(list(photos), left_out, described)
         if refine_poses or poses is None:
             settings = _for_poses(settings, photos)
-        lenses = _lenses(cameras, camera_model, poses)
+        lenses = _lenses(cameras, camera_model or default_model(len(photos)), poses)
         white, _ = find_white([images / name for name in photos])
         key = work_key(
             *(photos, lenses, masks, settings.seed),
             # Features are found in copies of photographs that use fewer than 16 bits.
             features=[settings.max_image_size, settings.doubled, white],
-            pairs=[settings.matcher, refine_poses],
+            pairs=[settings.matcher, refine_poses, camera_model],
         )
         options = camera_model, poses, refine_poses, test_names, masks, partial
         work = resumable_work(Path(output), key, note, resume=resume)
@@ -196,7 +208,7 @@ def _reconstruct(
     staging: Path,
     names: Sequence[str],
     cameras: Sequence[SharedCamera],
-    camera_model: str,
+    camera_model: str | None,
     poses: Sequence[Image] | None,
     refine_poses: bool,
     test_names: Collection[str],
@@ -205,11 +217,17 @@ def _reconstruct(
 ) -> SfmReport:
     refinement: Refinement | None = None
     finding: Finding | None = None
+    held: Finding | None = None
     if poses is None:
-        model = colmap.guessed_model(run, cameras, camera_model)
+        count, chosen = len(names), camera_model or default_model(len(names))
+        model = colmap.guessed_model(run, cameras, chosen)
+        if camera_model is None and count < MIN_DISTORTION:
+            known = all(camera.has_prior_focal_length for camera in model.cameras.values())
+            run = replace(run, holds_focal=known and count < MIN_FOCAL)
+            held = held_lens(count, focal=run.holds_focal)
         agreement = match_photographs(run, model, masks)
         further = None if agreement is None else lambda lost: match_further(run, agreement, lost)
-        model_dir, finding = map_images(run, names, camera_model, further, partial=partial)
+        model_dir, finding = map_images(run, names, chosen, further, partial=partial)
     else:
         match_photographs(run, colmap.posed_model(run.pycolmap, poses), masks, poses)
         if refine_poses:
@@ -220,7 +238,7 @@ def _reconstruct(
     return replace(
         _report(run, staging, names),
         num_pairs=run.num_pairs(),
-        findings=() if finding is None else (finding,),
+        findings=tuple(each for each in (held, finding) if each is not None),
         refinement=refinement,
         poses=tuple(poses or ()),
     )
@@ -302,7 +320,7 @@ def refined(
     """
     require("pycolmap")
     folder, own = photograph_folder(scene).absolute(), len(scene.points)
-    test = scene.split(test_every)[1] if test_every or scene.listed else ()
+    test = scene.split(test_every)[1]
     photos, _ = find_photos(folder)
     poses = match_poses(photos, scene, folder)
     with TemporaryDirectory(prefix="splatseed-refine-") as name:
@@ -418,8 +436,8 @@ def _call(
     """Run a job in a child process; return its result."""
     log = staging / _WORK / "log.txt"
     call = (_work, images, staging, settings, kept, job, arguments)
-    limit = {"NUMBA_NUM_THREADS": str(settings.threads)} if settings.threads > 0 else {}
-    environment = {**_CHILD, **limit}
+    limited = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS") if settings.threads > 0 else ()
+    environment = {**_CHILD, **dict.fromkeys(limited, str(settings.threads))}
     with closing(Child(*call, reports=True, environment=environment, log=log.open("w+b"))) as child:
         try:
             return child.result(progress)

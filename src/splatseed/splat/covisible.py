@@ -73,10 +73,8 @@ def find_covisible(
         for grid in pool.map(lambda view: _depths(view, xyz, maps), views):
             depths.append(grid)
             progress(_STAGE, 0.5 * len(depths) / len(views))
-        # At depth edges both surfaces are visible: take the largest depth of each neighbourhood.
-        farthest = (maximum_filter(grid, size=3, mode="nearest") for grid in depths)
-        seen, own = list(zip(train, farthest, strict=False)), depths[len(train) :]
-        grids = pool.map(lambda view, grid: _covisible(view, grid, seen), test, own)
+        seen, own = list(zip(train, map(farthest, depths), strict=False)), depths[len(train) :]
+        grids = pool.map(lambda view, grid: seen_cells(view, grid, seen), test, own)
         for view, grid in zip(test, grids, strict=True):
             by_view[view.name] = grid
             progress(_STAGE, 0.5 + 0.5 * len(by_view) / len(test))
@@ -124,22 +122,36 @@ def _depths(
     return depths
 
 
-def _covisible(
+def farthest(depths: Float32[np.ndarray, "rows cols"]) -> Float32[np.ndarray, "rows cols"]:
+    """Return the largest depth around each cell: at depth edges both surfaces are visible."""
+    return np.asarray(maximum_filter(depths, size=3, mode="nearest"))
+
+
+def seen_cells(
     view: View,
     depths: Float32[np.ndarray, "rows cols"],
-    seen: Sequence[tuple[View, Float32[np.ndarray, "rows cols"]]],
+    others: Sequence[tuple[View, Float32[np.ndarray, "rows cols"]]],
+    min_views: int = COVISIBILITY.min_views,
 ) -> Bool[np.ndarray, "rows cols"]:
+    """Return the cells of a view that at least ``min_views`` others see.
+
+    Args:
+        view: The view.
+        depths: The planar depth of its cells; infinite where unknown.
+        others: Views with the ``farthest`` depths of their cells.
+        min_views: Of the others, for a cell to count.
+    """
     rows, cols = depths.shape
     known = np.isfinite(depths)
     # The cells' centres at their depths, in the world.
     uv = pixel_centers(rows, cols).reshape(-1, 2) * [view.width / cols, view.height / rows]
     xyz = np.asfortranarray(view.camera.unproject(uv, np.where(known, depths, -1.0).ravel()))
     count = np.zeros(rows * cols, np.int32)
-    for other, farthest in seen:
+    for other, limits in others:
         points = points_in_image(other.camera, xyz)
-        there = farthest[points.cells(other.camera, farthest.shape)]
+        there = limits[points.cells(other.camera, limits.shape)]
         count[points.point_idx] += there >= (1.0 - SURFACE) * points.depth
-    return np.asarray((count.reshape(depths.shape) >= COVISIBILITY.min_views) & known)
+    return np.asarray((count.reshape(depths.shape) >= min_views) & known)
 
 
 def write_covisible(path: Path, grids: Grids) -> None:

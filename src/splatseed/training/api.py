@@ -22,12 +22,13 @@ from splatseed.errors import ParameterError
 from splatseed.io import load_scene
 from splatseed.io.files import StrPath, read_text
 from splatseed.io.masks import with_masks
+from splatseed.io.staging import reserved
 from splatseed.photos.loading import user_cache_dir
 from splatseed.photos.sizes import factor_for_side
 from splatseed.photos.view import View, camera_views, view_of
-from splatseed.progress import Note, Progress, silent, silent_note
+from splatseed.progress import Note, Progress, log_note, silent, silent_note
 from splatseed.requirements import require
-from splatseed.scene import Image, Scene
+from splatseed.scene import MIN_HELD_OUT, Image, Scene
 from splatseed.scores import EvalResult
 from splatseed.seeding.budget import in_rho, median_pixels, median_size, parse_budget
 from splatseed.settings import change_settings
@@ -79,7 +80,7 @@ class Run:
         """Scores of the test views and the run's numbers (metrics.json).
 
         ``psnr`` and ``cc_psnr`` in dB, ``ssim``, ``flip``, ``num_gaussians``, ``train_seconds``,
-        ``per_image``, ...
+        ``per_image``, ...; scores are None if no photograph was held out.
         """
         content: dict[str, Any] = json.loads(read_text(RunFolder(self.folder).metrics))
         return content
@@ -116,11 +117,11 @@ def train(
     output: StrPath,
     *,
     on_step: Callable[[int], None] = lambda _: None,
-    note: Note = silent_note,
+    note: Note = log_note,
     progress: Progress = silent,
     **options: Any,
 ) -> Run:
-    """Train Gaussians on a scene and score them on its test views.
+    """Train Gaussians on a scene and score them on its test views, which few photographs lack.
 
     Args:
         scene: A scene with photographs, or its path. Its points are the seeds; where they are not
@@ -128,7 +129,7 @@ def train(
             (``seeding="scene"`` keeps them as they are).
         output: The folder of the run.
         on_step: Called after each step with the number of steps done.
-        note: Called with each finding for the user, such as ``print``.
+        note: Called with each finding for the user, such as ``print``; by default they are logged.
         progress: Called with the name of a stage and its fraction done.
         **options: Fields of ``TrainSettings``: ``strategy``, ``max_steps``, ``data_factor``,
             ``seed``, ``test_every``, ``backend``, ``start``, ``exposure``, ``seeding``, ...; and of
@@ -138,7 +139,8 @@ def train(
 
     Raises:
         ParameterError: An option is unknown or out of range, or differs from the resumed run's.
-        OutputError: ``output`` is taken, protected or cannot be written.
+        OutputError: ``output`` is taken, protected or cannot be written, or another process
+            writes it.
         SceneNotFoundError: Fewer than half of the photographs are there.
         SceneFormatError: A camera, a photograph or the run to resume cannot be used.
         PointCloudError: Too few points, or more than fit into memory.
@@ -149,11 +151,12 @@ def train(
         run.metrics["psnr"]
     """
     request = TrainRequest.of(options)
-    training = prepare_training(scene, output, request, note=note, progress=progress)
-    if not training.train(on_step):
-        done = f"stopped after step {training.state.step}, which is kept: pass `resume=True`"
-        raise KeyboardInterrupt(done)
-    training.finish(partial(evaluate_views, progress=progress), progress)
+    with reserved(Path(output)):
+        training = prepare_training(scene, output, request, note=note, progress=progress)
+        if not training.train(on_step):
+            done = f"stopped after step {training.state.step}, which is kept: pass `resume=True`"
+            raise KeyboardInterrupt(done)
+        training.finish(partial(evaluate_views, progress=progress), progress)
     return Run(training.folder.path)
 
 
@@ -178,6 +181,8 @@ def prepare_training(
         note(finding)
     if scene.listed is not None:
         note(scene.listed.finding(given="test_every" in request.named))
+    if resumed is None and "test_every" not in request.named:
+        settings = _with_default_split(settings, scene, note)
     settings = _sized(settings, scene, request.long_side, resumed, note)
     settings = _within_budget(settings, request.budget, scene, note)
     if settings.seeding == "auto" and (why := no_seeding_reason(scene, settings)):
@@ -195,7 +200,7 @@ def evaluate(
     model: Run | Gaussians | StrPath,
     scene: Scene | StrPath | None = None,
     *,
-    note: Note = silent_note,
+    note: Note = log_note,
     progress: Progress = silent,
     **options: Any,
 ) -> EvalResult:
@@ -205,7 +210,7 @@ def evaluate(
         model: A run, Gaussians in the scene's frame, or the path of a run or of a file of any
             trainer (.ply, .spz, .sog, .splat).
         scene: The scene, or its path; a run knows its own.
-        note: Called with each finding for the user.
+        note: Called with each finding for the user; by default they are logged.
         progress: Called with the name of a stage and its fraction done.
         **options: Fields of ``EvaluateRequest``: ``data_factor`` and ``test_every``, by default as
             the run was trained; ``transform`` from the scene's frame to the model's (a file,
@@ -244,6 +249,18 @@ def _named_settings(request: TrainRequest, *, resumes: bool) -> TrainSettings:
         other = "refine_poses" if request.refine_poses else "seeding"
         raise ParameterError(f"`start` or `{other}`", found="both", fix="Leave one out.")
     return dataclasses.replace(settings, start=str(model_file(Path(settings.start)).resolve()))
+
+
+def _with_default_split(settings: TrainSettings, scene: Scene, note: Note) -> TrainSettings:
+    """The settings, with nothing held out of few photographs, unless the scene lists tests."""
+    chosen = scene.listed is not None or settings.test_every != TrainSettings.test_every
+    if chosen or scene.default_test_every == settings.test_every or not scene.images:
+        return settings
+    text = f"All {len(scene.images)} photographs are trained on: of fewer than {MIN_HELD_OUT}, "
+    text += "none is held out by default, so nothing is scored on unseen photographs."
+    fix = f"`test_every={settings.test_every}` holds some out, or list them (docs/formats.md)."
+    note(Finding("nothing-held-out", text, "info", fix=fix))
+    return dataclasses.replace(settings, test_every=scene.default_test_every)
 
 
 def _sized(

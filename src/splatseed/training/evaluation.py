@@ -26,6 +26,7 @@ from splatseed.photos.loading import user_cache_dir
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.scores import EvalResult
+from splatseed.settings import Range
 from splatseed.splat.covisible import find_covisible, pixel_masks
 from splatseed.splat.evaluate import OnView, TrainedModel, evaluate_model, load_model
 from splatseed.splat.gaussians import Gaussians
@@ -43,8 +44,8 @@ from splatseed.training.folder import config_of, model_file
 from splatseed.training.request import AS_TRAINED, EvaluateRequest
 from splatseed.training.settings import TrainSettings
 
-MINIMUM = {"data_factor": 1, "test_every": 2}
-"""Lower bounds of the numbers that a run's config gives where the caller does not."""
+LIMITS = {"data_factor": Range(1), "test_every": Range(2, also=0)}
+"""Of the numbers that a run's config gives where the caller does not."""
 
 
 @dataclass(frozen=True)
@@ -74,30 +75,40 @@ class Evaluation:
         if not isinstance(model, Gaussians):
             config, model = config_of(Path(model)), model_file(Path(model))
         values: dict[str, Any] = {"masks": request.masks or config.get("masks")}
-        for name, minimum in MINIMUM.items():
+        for name, limits in LIMITS.items():
             value = getattr(request, name)
             value = values[name] = config.get(name) if value is None else value
-            if value is not None and not (isinstance(value, int) and value >= minimum):
+            if value is not None and not (isinstance(value, int) and limits.contains(value, None)):
                 raise ParameterError(
-                    f"`{name}` of {minimum} or more",
-                    found=str(value),
-                    fix="Leave it out for the default.",
+                    f"`{name}` {limits}", found=str(value), fix="Leave it out for the default."
                 )
         return cls(model, _scene_of(model, scene, config), replace(request, **values), config)
 
     @property
     def test_every(self) -> int:
-        """Every n-th image is a test view."""
-        return self.request.test_every or TrainSettings.test_every
+        """Every n-th image is a test view; 0: none."""
+        every = self.request.test_every
+        return TrainSettings.test_every if every is None else every
 
     def load(self, progress: Progress = silent) -> TrainedModel:
         """Read the model and the photographs of its test views.
 
         Photographs that the run left out for their poses are no test views.
+
+        Raises:
+            ParameterError: The run held nothing out, and the scene lists no tests.
         """
         scene = self.scene
         if not isinstance(scene, Scene):
             scene = load_scene(scene, require_points=False)
+        if not self.test_every and scene.listed is None:
+            every = TrainSettings.test_every
+            raise ParameterError(
+                "test views to score",
+                found="none: nothing was held out (test_every is 0)",
+                fix=f"Train with `test_every={every}`, or name a `scene` that lists test images. "
+                f"Here `test_every={every}` scores photographs that the run has seen.",
+            )
         return load_model(
             self.model,
             without_dropped(scene, self.config),

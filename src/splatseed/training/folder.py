@@ -40,7 +40,7 @@ class RunFolder:
         self.metrics = path / "metrics.json"  # the scores, once the run has finished
         self.gaussians = path / RUN_FILE
         self.curve_csv, self.curve_png = path / "curve.csv", path / "curve.png"
-        self.renders = path / "renders"  # test views next to their photographs
+        self.renders = path / "renders"  # test views, if any, next to their photographs
         self.tensorboard = path / "tensorboard"  # its log, if requested
         self.scene = path / "scene"  # at refined poses, if the run refined them
 
@@ -219,7 +219,8 @@ def write_curve_png(path: Path, records: Sequence[Record]) -> None:
     shown = [r.train_psnr for r in records]
     psnrs.plot(steps, shown, color="C0", alpha=0.35, label="training, single photographs")
     tested = [(r.step, r.test_psnr) for r in records if r.test_psnr is not None]
-    psnrs.plot(*zip(*tested, strict=True), "o-", color="C0", label="test, mean")
+    if tested:
+        psnrs.plot(*zip(*tested, strict=True), "o-", color="C0", label="test, mean")
     psnrs.set_ylabel("PSNR, dB")
     psnrs.legend(loc="lower right")
     counts.plot(steps, [r.num_gaussians for r in records], color="C2")

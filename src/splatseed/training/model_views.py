@@ -36,7 +36,7 @@ from splatseed.training.settings import TrainSettings
 
 NO_CONFIG: Mapping[str, Any] = MappingProxyType({})
 MAX_COMPARED = 6
-"""Test views from which a model before and after a change is rendered."""
+"""Views from which a model before and after a change is rendered."""
 
 
 class ModelViews(NamedTuple):
@@ -45,13 +45,16 @@ class ModelViews(NamedTuple):
     train: tuple[View, ...]
     """Training views; without photographs, with masks."""
     test: tuple[View, ...]
-    """Some of the test views; with their photographs, if the scene has them."""
+    """Some of the test views, or of the training views if nothing was held out; with their
+    photographs, if the scene has them."""
     frame: TrainingFrame
     """To render in."""
     scene: Scene
     """Its background is behind renders, and behind transparent pixels of the photographs."""
     file_from_scene: Similarity | None
     """From the scene's frame to the file's; None if they are the same."""
+    label: str
+    """What the views in ``test`` are."""
 
 
 def find_model_views(
@@ -83,7 +86,7 @@ def find_model_views(
     with suppress(SceneNotFoundError):
         scene, photographed = with_photographs(scene), True
     every = config.get("test_every")
-    every = every if isinstance(every, int) and every > 1 else TrainSettings.test_every
+    every = every if isinstance(every, int) and every != 1 else TrainSettings.test_every
     train, test = scene.split(every)
     if not train:
         raise SceneNotFoundError(
@@ -115,6 +118,7 @@ def find_model_views(
         frame_of_model(views, points if world is None else world.points(points), gaussians),
         scene,
         world,
+        "test view" if test else "training view",
     )
 
 

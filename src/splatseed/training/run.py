@@ -1,4 +1,4 @@
-"""A training run: it trains, scores its test views, and leaves a folder of results.
+"""A training run: it trains, scores its test views if any, and leaves a folder of results.
 
 Promise: results are in the scene's frame; running out of GPU memory raises one error that suggests
 a budget; an interrupted run keeps a checkpoint.
@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float32
 
 from splatseed.errors import OutputError, PointCloudError
+from splatseed.findings import LOGGER
 from splatseed.io.staging import write_json
 from splatseed.photos.view import View
 from splatseed.progress import Progress, silent
@@ -139,7 +140,9 @@ class TrainingRun:
             # The file that the user gets is scored, read back.
             world = read_gaussians(folder.gaussians)
             render = ModelRenderer(world, self.frame, self.trainer.device).image
-            scores = score(render, self._test_views, on_view=self._draw)
+            scores = EvalResult(())
+            if self._test_views:
+                scores = score(render, self._test_views, on_view=self._draw)
             result = TrainingResult(
                 dataclasses.replace(scores, num_gaussians=len(world), model_bytes=world.num_bytes),
                 tuple(
@@ -169,8 +172,13 @@ class TrainingRun:
             for name, value in zip(BOARD_NAMES, record[1:], strict=True):
                 if value is not None:
                     self._board.add_scalar(name, value, record.step)
-        if record.test_psnr is None:
+        if record.test_psnr is None and self._test_views:
             return
+        text = "step %d: %d Gaussians, PSNR %.2f dB"
+        shown = [record.step, record.num_gaussians, record.train_psnr]
+        if record.test_psnr is not None:
+            text, shown = f"{text}, of test views %.2f dB", [*shown, record.test_psnr]
+        LOGGER.debug(text, *shown)
         write_curve_csv(self.folder.curve_csv, self.state.records)
         if self._saved_step is None or time.monotonic() - self._saved > CHECKPOINT_SECONDS:
             self._save()

@@ -49,7 +49,7 @@ def seeded(
     """
     if settings.start is not None:
         return scene, None
-    if saw_all_photographs(scene):
+    if saw_all_photographs(scene) and scene.split(settings.test_every)[1]:
         text = "The seeds were made from all photographs, test views included, which may flatter "
         text += "the score: train the scene itself, or seed without test views: "
         note(Finding("seeds-of-test-views", f"{text}`auto.test_every=8`."))

@@ -17,7 +17,7 @@ from splatseed.checkup.choices import UnfitPoints
 from splatseed.findings import Finding
 from splatseed.photos.sizes import TRAINED_SIDE, default_factor
 from splatseed.progress import Note, silent_note
-from splatseed.scene import Image
+from splatseed.scene import TEST_EVERY, Image
 from splatseed.settings import Range, check_settings
 from splatseed.training.schedule import FULL_RUN, Schedule, continued, make_schedule
 from splatseed.training.traits import AS_3DGS, NAMES, STRATEGIES, StrategyTraits, strategy_traits
@@ -73,8 +73,9 @@ class TrainSettings:
     sh_degree: tyro.conf.Suppress[Annotated[int, Range(0, 3)]] = 3
     """Degree of the spherical harmonics: how finely colours depend on the viewing direction, 0 to
     3."""
-    test_every: Annotated[int, Range(2)] = 8
-    """Keep every n-th image, sorted by name, for testing."""
+    test_every: Annotated[int, Range(2, also=0)] = TEST_EVERY
+    """Keep every n-th image, sorted by name, for testing; 0: none. Of fewer than 12 photographs,
+    train keeps none by default."""
     exposure: Exposure = "none"
     """Colour transform of each training photograph, learnt with the Gaussians, for photographs of
     changing exposure or white balance: affine, or none. Judge by the colour-corrected PSNR."""

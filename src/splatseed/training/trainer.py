@@ -157,7 +157,8 @@ class Trainer:
         loss = float(torch.stack(state.losses).mean(dtype=torch.float64))
         state.watch.stop()
         state.losses.clear()
-        test_psnr, test_ssim = self.test_scores() if self._is_due(NUM_TESTS) else (None, None)
+        due = self._is_due(NUM_TESTS) and self.test_views
+        test_psnr, test_ssim = self.test_scores() if due else (None, None)
         seconds = round(state.watch.seconds, 3)
         shown = round(psnr(render, photograph, mask_tensor(view, self.device)), 4)
         count = len(state.params["means"])

@@ -25,7 +25,7 @@ from splatseed.photos.camera_check import reference_points
 from splatseed.photos.upright import quarter_turns, turned
 from splatseed.photos.view import View, camera_views, view_of
 from splatseed.progress import Note
-from splatseed.scene import BLACK, Color, Scene
+from splatseed.scene import BLACK, TEST_EVERY, Color, Scene
 from splatseed.similarity import Similarity
 from splatseed.splat.background import background_of
 from splatseed.splat.formats import holds_gaussians, read_gaussians, unpacked_model
@@ -51,7 +51,7 @@ class ViewerItem:
         scene: The scene.
         gaussians: The model.
         data_factor: By which the model's run downsampled photographs.
-        test_every: Every n-th image by name is a test view.
+        test_every: Every n-th image by name is a test view; 0: none.
         findings: What was changed in the model on reading.
         moved: How the model was moved from its trainer's frame; None if it was in the scene's.
         background: Of its renders, over which transparent pixels of photographs are composited.
@@ -61,7 +61,7 @@ class ViewerItem:
     scene: Scene | None = None
     gaussians: Gaussians | None = None
     data_factor: float = 1
-    test_every: int = 8
+    test_every: int = TEST_EVERY
     findings: tuple[Finding, ...] = ()
     moved: Similarity | None = None
     background: Color = BLACK
@@ -118,7 +118,7 @@ def open_item(path: StrPath, scene_path: Path | None = None) -> ViewerItem:
                 found="no images, points or Gaussians",
                 fix="Name a scene, a run, or a file of points or Gaussians.",
             )
-        return ViewerItem(path.name, scene)
+        return ViewerItem(path.name, scene, test_every=scene.default_test_every)
     if not folder.gaussians.is_file():
         raise SceneNotFoundError(
             f"{folder.path} to be a finished run of splatseed train",
@@ -127,7 +127,7 @@ def open_item(path: StrPath, scene_path: Path | None = None) -> ViewerItem:
         )
     scene = scene_at(scene_path) or scene_of_run(folder)
     config = folder.read_config()
-    factor, every = float(config.get("data_factor") or 1), int(config.get("test_every") or 8)
+    factor, every = float(config.get("data_factor") or 1), int(config.get("test_every", TEST_EVERY))
     gaussians, moved = read_gaussians(folder.gaussians, findings.append), None
     if scene is not None:
         own = has_run_poses(config, scene)

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from splatseed.commands.options import check_free
 from splatseed.commands.upsample import report
 from splatseed.commands.upsample.options import CLOUD, Options, check, parse
-from splatseed.console import OUT, StageClock, print_note, stage_display
+from splatseed.console import StageClock, print_message, print_note, stage_display
 from splatseed.findings import Finding
 from splatseed.io import load_originals, write_scene
 from splatseed.io.clouds import open_cloud
@@ -33,6 +33,7 @@ from splatseed.io.staging import add_files, check_output, write_json
 from splatseed.methods import Upsampler, configure, number_of_new, planned_size, traits_of
 from splatseed.photos.camera_check import stray_cameras
 from splatseed.progress import Note, Progress
+from splatseed.requirements import require
 from splatseed.runtime.memory import format_bytes
 from splatseed.scene import Scene
 from splatseed.seeding import photo_methods
@@ -65,6 +66,7 @@ def run(arguments: list[str]) -> None:
     check_output(options.output, kind="upsample", overwrite=options.overwrite, protect=protect)
     if options.gaussians is not None:
         check_free(options.gaussians, overwrite=options.overwrite, protect=protect)
+    require(*["pycolmap"] * options.refine_poses)
     clouds: Any = methods[CLOUD]
     for file in options.cloud_files:
         open_cloud(file, clouds.columns)  # reads the header, so that a bad file fails first
@@ -251,12 +253,11 @@ def _announce(
         how = f": {points} points, so depth is found by comparing photographs{where}"
     points = f"{counted(len(scene.points), 'point')}{report.in_place_of(replaced)}"
     size = f"{counted(len(scene.images), 'image')}, {points}"
-    OUT.print(
+    print_message(
         f"{visible(options.scene)} ({scene.source.format}, {size})\n"
         f"  -> {report.method_description(name, method, options.profile)}{how}\n  "
         f"-> {visible(options.output)} ({number}{describe_rho(scene, options.budget)}, "
-        f"seed {options.seed}){memory_note}",
-        soft_wrap=True,
+        f"seed {options.seed}){memory_note}"
     )
 
 

@@ -39,7 +39,8 @@ class Options:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The scene folder to write."""
     method: str = DEFAULT_METHOD
-    """The method that makes new points; --method NAME --help shows its own options."""
+    """The method that makes new points; --method NAME --help shows its own options. FILE.py:NAME
+    is a method of your own."""
     ratio: float | None = None
     """Total points per original point, for methods that interpolate; 4 unless --num-points is
     given."""
@@ -121,8 +122,10 @@ class _Choice:
 def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
     """Parse the options of the verb and of every method."""
     chosen = parse_some(_Choice, arguments)
+    names = dict.fromkeys(METHODS)
     if chosen.method is not None:
         METHODS[chosen.method]  # raises for an unknown one, with advice
+        names[chosen.method] = None
 
     def parsed(names: Iterable[str], *, quiet: bool = False) -> Any:
         kind = _with_methods({name: configure(name, chosen.profile) for name in names})
@@ -131,20 +134,28 @@ def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
     if {"-h", "--help"} & set(arguments):  # the options of all methods are too many to read
         parsed([] if chosen.method is None else [chosen.method])
     try:  # the options of all methods would take four times as long
-        options = parsed((name for name in METHODS if _has_options(name, arguments)), quiet=True)
+        with_options = (name for name in names if ":" in name or _has_options(name, arguments))
+        options = parsed(with_options, quiet=True)
     except SystemExit as stop:
         if not stop.code:  # what was asked for is printed
             raise
-        options = parsed(METHODS)  # what is wrong is told with all methods in view
+        options = parsed(names)  # what is wrong is told with all methods in view
     if options.cloud_files and chosen.method is None:
         options = replace(options, method=CLOUD)
     return options, {
-        name: getattr(options, name, None) or configure(name, chosen.profile) for name in METHODS
+        name: getattr(options, _field(name), None) or configure(name, chosen.profile)
+        for name in names
     }
 
 
+def _field(method: str) -> str:
+    """Return the prefix of a method's options: its name, without its place."""
+    name = method.rpartition(":")[2]
+    return f"own_{name}" if name != method and name in METHODS else name
+
+
 def _has_options(method: str, arguments: list[str]) -> bool:
-    start = f"--{method}.".replace("_", "-")  # tyro takes either
+    start = f"--{_field(method)}.".replace("_", "-")  # tyro takes either
     return any(word.replace("_", "-").startswith((start, "--tyro-")) for word in arguments)
 
 
@@ -157,12 +168,14 @@ def _with_methods(methods: Mapping[str, Upsampler]) -> type[Options]:
     """Return the options with a field per method, whose default is the method given."""
     # Named here, a method's help need not be searched for in sources, half the time to parse.
     fields: list[Any] = [
-        (name, type(method), dataclasses.field(default=method, metadata={"help": getdoc(method)}))
-        for name, method in methods.items()
-    ]
+        (_field(name), type(method),
+         dataclasses.field(default=method, metadata={"help": getdoc(method)}))
+        for name, method in methods.items() if dataclasses.is_dataclass(method)
+    ]  # fmt: skip
+    names = tuple(dict.fromkeys((*METHODS, *methods)))
     full = dataclasses.make_dataclass(
         "UpsampleOptions",
-        [("method", Literal[tuple(METHODS)], dataclasses.field(default=DEFAULT_METHOD)), *fields],
+        [("method", Literal[names], dataclasses.field(default=DEFAULT_METHOD)), *fields],
         bases=(Options,),
         frozen=True,
     )

@@ -6,17 +6,18 @@ import dataclasses
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from splatseed.commands.next_steps import print_training
 from splatseed.commands.upsample.options import Options
-from splatseed.console import StageClock, print_note, print_pairs
+from splatseed.console import StageClock, add_results, print_note, print_pairs
 from splatseed.depthmap import in_scene_units
 from splatseed.findings import Finding
 from splatseed.io import WriteReport
 from splatseed.io.load import depths_beside
+from splatseed.io.staging import read_manifest
 from splatseed.methods import (
     Profile,
     Upsampler,
@@ -56,7 +57,9 @@ INTERPOLATING = ("linear", "triangle", "spline", "mls", "voronoi", "random")
 
 def parameters_of(method: Upsampler) -> dict[str, object]:
     """Return a method's parameters by name, without those of a cloud that other lines show."""
-    given = dataclasses.asdict(method)  # type: ignore[call-overload]  # a method is a dataclass
+    given: dict[str, Any] = {}
+    if dataclasses.is_dataclass(method) and not isinstance(method, type):
+        given = dataclasses.asdict(method)
     return {name: value for name, value in given.items() if name not in CLOUD_PARAMETERS}
 
 
@@ -261,6 +264,8 @@ def summarise(
         paths = [output / name for name in names if (output / name).is_file()]
         rows += [("" if i else label, str(path)) for i, path in enumerate(paths)]
     print_pairs("splatseed upsample", rows)
+    made_by = {key: value for key, value in read_manifest(output).items() if key != "files"}
+    add_results(output=output, **made_by, origins=origins, seconds=seconds)
     print_note(*written.findings)
     if written.layout == "transforms":
         text = (
