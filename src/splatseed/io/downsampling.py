@@ -41,15 +41,17 @@ def area_means(
         side = int(factor)
         cut = pixels[: rows * side, : columns * side]
         return np.asarray(cut.reshape(rows, side, columns, side, *pixels.shape[2:]).mean((1, 3)))
-    means: np.ndarray = pixels
-    for axis, count in ((0, rows), (1, columns)):
-        step = means.shape[axis] / count
-        edges = np.arange(count + 1) * step
-        whole = np.minimum(edges.astype(np.int64), means.shape[axis] - 1)
-        # Sums up to each edge: of the pixels before, and of the covered part of the next.
-        exact = np.float64 if means.dtype == np.float64 else np.uint32
-        sums = np.cumsum(means, axis=axis, dtype=exact)
-        sums = np.concatenate([np.zeros_like(sums.take([0], axis)), sums], axis=axis)
-        part = (edges - whole).reshape([-1 if i == axis else 1 for i in range(means.ndim)])
-        means = np.diff(sums.take(whole, axis) + part * means.take(whole, axis), axis=axis) / step
-    return means
+    across = _means_down(_means_down(pixels, rows).swapaxes(0, 1), columns)
+    return np.ascontiguousarray(across.swapaxes(0, 1))
+
+
+def _means_down(pixels: Shaped[np.ndarray, "H ..."], count: int) -> Float64[np.ndarray, "h ..."]:
+    """Return the means of ``count`` equal parts of the rows, each a row long or more."""
+    step = len(pixels) / count
+    edges = np.arange(count) * step
+    first = edges.astype(np.int64)  # the row in which a part begins
+    before = (edges - first).reshape(-1, *[1] * (pixels.ndim - 1)) * pixels[first]
+    kind = np.float64 if pixels.dtype == np.float64 else np.uint32
+    sums = np.add.reduceat(pixels, first, axis=0, dtype=kind) - before
+    sums[:-1] += before[1:]
+    return np.asarray(sums / step)

@@ -238,7 +238,7 @@ def read_mask(
         return None
     counts = _reduced(np.logical_and.reduce(parts), factor)
     if counts.size and not counts.any():
-        reduced = "" if factor == 1 else f", reduced by a factor of {factor}"
+        reduced = "" if factor == 1 else f", reduced by a factor of {factor:g}"
         raise SceneFormatError(
             f"unmasked pixels of {name} by its mask, {path or photograph}{reduced}",
             found="none",

@@ -1,8 +1,7 @@
 """The sizes at which photographs are used: of their files, divided by a factor.
 
-A photograph is never enlarged. The factor is whole (``io.downsampling``) unless training is to use
-an exact size: then pixels at the edge that fill no block are cut off, so intrinsics are divided by
-the factor and nothing else changes.
+A photograph is never enlarged. The factor (``io.downsampling``) is whole, so that intrinsics are
+divided by it and nothing else changes, unless training is to use an exact size.
 """
 
 from __future__ import annotations
@@ -68,7 +67,7 @@ def check_side(name: Path | str, min_side: int, data_factor: float, size: tuple[
     if min(size) < min_side:
         pixels = "pixel" if min_side == 1 else "pixels"
         raise SceneFormatError(
-            f"{name} to have at least {min_side} {pixels} a side, divided by {data_factor}",
+            f"{name} to have at least {min_side} {pixels} a side, divided by {data_factor:g}",
             found=f"{size[0]} x {size[1]}",
             fix="Choose a smaller `data_factor`, or a larger `long_side`.",
         )

@@ -22,6 +22,7 @@ GAUSSIANS_PER_SEED = 3.0
 """Gaussians at the end of a run per seed, with densification and without a cap: a guess."""
 HOUR, TOO_LONG = 3600.0, 5400.0
 """Seconds of a suggested run, and seconds above which a shorter run is suggested."""
+_ROUNDING = 1e-6
 MIN_SIDE = 400
 """Longer side, px, down to which smaller photographs are suggested before fewer steps."""
 FEWER_STEPS, STEP_UNIT = 7000, 100
@@ -115,5 +116,5 @@ def options_for_an_hour(
             break
     else:  # the budget alone takes longer
         steps = max(STEP_UNIT, int(steps * HOUR / needed) // STEP_UNIT * STEP_UNIT)
-    flags = f"`long_side={math.ceil(long_side / factor)}`"
+    flags = f"`long_side={math.ceil(long_side / factor - _ROUNDING)}`"
     return flags if steps == settings.max_steps else f"{flags} `max_steps={steps}`"

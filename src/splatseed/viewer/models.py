@@ -127,7 +127,7 @@ def open_item(path: StrPath, scene_path: Path | None = None) -> ViewerItem:
         )
     scene = scene_at(scene_path) or scene_of_run(folder)
     config = folder.read_config()
-    factor, every = float(config.get("data_factor") or 1), int(config.get("test_every", TEST_EVERY))
+    factor, every = config.get("data_factor") or 1, int(config.get("test_every", TEST_EVERY))
     gaussians, moved = read_gaussians(folder.gaussians, findings.append), None
     if scene is not None:
         own = has_run_poses(config, scene)
