@@ -2,9 +2,9 @@
 
 Promise: the page needs no network and no server; a browser opens it from disk. It draws what the
 ``.sog`` keeps: sizes, opacities and colours that depend on the view, as sharp as training saw them
-(``_as_trained``). The folder ``supersplat`` has
-the stylesheet and the bundle of @playcanvas/supersplat-viewer 1.36.2 as published, compressed by
-``gzip -9n``, and its licence. Source of its options and settings: its API reference.
+(``_as_trained``). The folder ``supersplat`` has the stylesheet and the bundle of
+@playcanvas/supersplat-viewer 1.36.2 as published, compressed by ``gzip -9n``, and its licence.
+Source of its options and settings: its API reference.
 
 Notation: the page's frame is the viewer frame, turned so that up is -y: the viewer turns a file's
 axes by half a turn about z, and takes y for up.
