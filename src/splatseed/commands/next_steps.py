@@ -149,13 +149,13 @@ def advice_commands(
     train, label = f"splatseed train {source} {how}-o RUN", "train"
     shorter: Commands = []
     if not (which("nvidia-smi") or which("rocminfo")):
-        seeds = advice.method == "auto"
-        first_seconds = _seconds_before(scene, seeds=seeds, refine=refine and seeds)
+        made = advice.method == "auto"
+        first_seconds = _seconds_before(scene, seeds=made, refine=refine and made)
         label = f"train, about {format_duration(planned.seconds + first_seconds)}"
         small = Planned.of(scene, None, SMALL_STEPS, long_side=SMALL_SIDE)
         how = f"{refining}--long-side {SMALL_SIDE} --max-steps {SMALL_STEPS} -o SMALL"
         command = f"splatseed train {source} {how}"
-        first_seconds = _seconds_before(scene, seeds=seeds, refine=refine)
+        first_seconds = _seconds_before(scene, seeds=made, refine=refine)
         shorter = [(f"or about {format_duration(small.seconds + first_seconds)}", command)]
     commands = [*first, (label, train), *shorter]
     if advice.method == "auto":

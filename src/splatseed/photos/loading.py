@@ -225,7 +225,7 @@ def load_photograph(
     width, height = reduced_size(original.width, original.height, factor)
     check_side(path, 1, factor, (width, height))
     if not is_whole(factor):
-        pixels = np.rint(area_means(np.array(original), factor)).astype(np.uint8)
+        pixels = np.array(np.rint(area_means(np.array(original), factor)), np.uint8)
     elif factor > 1:
         side = int(factor)
         pixels = np.array(original.reduce(side, (0, 0, width * side, height * side)))

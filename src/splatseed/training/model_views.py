@@ -93,8 +93,8 @@ def find_model_views(
             f"{scene_path} to have images", found="none", fix="Name a scene with its cameras."
         )
     factor = config.get("data_factor")
-    known = isinstance(factor, int | float) and factor >= 1
-    factor = factor if known else default_factor(scene.images)
+    if not isinstance(factor, int | float) or factor < 1:
+        factor = default_factor(scene.images)
     own = has_run_poses(config, scene)
     world = _file_from_scene(path, gaussians, scene, own=own)
 
