@@ -176,7 +176,7 @@ def _checked(options: Options) -> _Job:
         (page and transform is not None, "--transform for a file of Gaussians", "a web page",
          "A page shows the model in its scene's frame: leave it out."),
     )  # fmt: skip
-    if cleans:
+    if cleans or page:  # a page's harmonics are turned
         require("torch")
     if named and options.budget is not None:
         require("torch", "gsplat")
@@ -201,9 +201,9 @@ def _views(job: _Job, gaussians: Gaussians, progress: Progress, note: Note) -> M
     if job.scene is None or not needed:
         return None
     named = job.options.scene is not None
-    if not named and not job.is_page and not all(map(version_of, ("torch", "gsplat"))):
+    if not named and not job.is_page and not _renders():
         return None
-    if named or not job.is_page:
+    if not job.is_page:
         require("torch", "gsplat")
     from splatseed.training.model_views import find_model_views
 
@@ -311,14 +311,19 @@ def _write_page(
     return shown if world is None else transform_gaussians(shown, world)
 
 
+def _renders() -> bool:
+    """Whether the packages that render are there."""
+    return all(map(version_of, ("torch", "gsplat")))
+
+
 def _loss(
     stages: Mapping[str, Gaussians], views: ModelViews | None, *, cropped: bool, progress: Progress
 ) -> RenderLoss | None:
-    """Compare renders of the stages of a model; None for a single one, or without PyTorch.
+    """Compare renders of the stages of a model; None for a single one, or where none are made.
 
     A model without a scene is rendered from cameras around it. Photographs show more than a crop.
     """
-    if len(stages) < 2 or version_of("torch") is None:
+    if len(stages) < 2 or not _renders():
         return None
     from splatseed.splat.render_loss import measure_loss
     from splatseed.splat.training_frame import NO_POINTS, frame_of_model
