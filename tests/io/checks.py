@@ -17,7 +17,7 @@ from splatseed.io.depth_maps import read_capture_scale, read_description
 from splatseed.io.ply import read_ply
 from splatseed.io.polycam import _read_camera
 from splatseed.io.record3d import _read_metadata
-from splatseed.io.rgbd import _read_intrinsics, _read_list, _read_track
+from splatseed.io.rgbd import _read_list, _read_track, read_camera_file
 from splatseed.io.scanner_app import _read_frame
 from splatseed.io.stray import _read_camera as _read_stray_camera, _read_track as _read_odometry
 
@@ -31,7 +31,7 @@ def read_images(path):
 
 
 def read_capture_camera(path):
-    return read_capture_scale(path), _read_intrinsics(path)
+    return read_capture_scale(path), read_camera_file(path)
 
 
 def read_scanner_frame(path):

@@ -33,6 +33,8 @@ class NotFiniteError(SceneFormatError):
     """A camera or pose is NaN, infinite or zero; the scene can be used without its images."""
 
 
+Lens: TypeAlias = tuple[str, tuple[float, ...]]
+"""COLMAP's model and parameters."""
 Unusable: TypeAlias = dict[Any, NotFiniteError]
 """Why records were left out, by camera id or image name."""
 
@@ -44,7 +46,7 @@ def make_intrinsics(
     check_record(0 <= camera_id <= MAX_ID, f"a camera id from 0 to {MAX_ID}", where, camera_id)
     fits = 0 < width <= _MAX_SIZE and 0 < height <= _MAX_SIZE
     check_record(fits, "a camera size in pixels", where, f"{width} x {height}")
-    _require_finite(
+    require_finite(
         all(map(math.isfinite, params)), "finite camera parameters", where, tuple(params)
     )
     try:
@@ -54,15 +56,46 @@ def make_intrinsics(
         raise SceneFormatError(expected, found=error.found, fix=error.fix) from None
     lengths = camera.params[: CAMERA_MODELS[model].num_focal]
     found = ", ".join(f"{each:g}" for each in lengths)
-    _require_finite(min(lengths) > 0, "a focal length above 0", where, found)
+    require_finite(min(lengths) > 0, "a focal length above 0", where, found)
     return camera
+
+
+def brown(
+    focal: tuple[float, float],
+    center: tuple[float, float],
+    radial: Sequence[float] = (),
+    tangential: tuple[float, float] = (0.0, 0.0),
+) -> Lens:
+    """Return the simplest of COLMAP's models for Brown and Conrady's with OpenCV's p1 and p2.
+
+    ``radial`` are the coefficients of r^2, r^4 and r^6.
+    """
+    k1, k2, k3 = (*radial, 0.0, 0.0, 0.0)[:3]
+    if k3:
+        return "FULL_OPENCV", (*focal, *center, k1, k2, *tangential, k3, 0.0, 0.0, 0.0)
+    if any((k1, k2, *tangential)):
+        return "OPENCV", (*focal, *center, k1, k2, *tangential)
+    return "PINHOLE", (*focal, *center)
+
+
+def fisheye(
+    focal: tuple[float, float],
+    center: tuple[float, float],
+    radial: Sequence[float] = (),
+    tangential: tuple[float, float] = (0.0, 0.0),
+) -> Lens:
+    """Return COLMAP's model of an equidistant lens with terms of theta^2 to theta^8."""
+    k1, k2, k3, k4 = (*radial, 0.0, 0.0, 0.0, 0.0)[:4]
+    if any(tangential):
+        return "THIN_PRISM_FISHEYE", (*focal, *center, k1, k2, *tangential, k3, k4, 0.0, 0.0)
+    return "OPENCV_FISHEYE", (*focal, *center, k1, k2, k3, k4)
 
 
 def check_pose(pose: Sequence[float], of: str, where: str) -> None:
     """Raise a ``NotFiniteError`` unless a wxyz quaternion and a translation make a pose."""
-    _require_finite(all(map(math.isfinite, pose)), f"a finite pose {of}", where, tuple(pose))
+    require_finite(all(map(math.isfinite, pose)), f"a finite pose {of}", where, tuple(pose))
     is_rotation = _NORM_RANGE[0] < math.hypot(*pose[:4]) < _NORM_RANGE[1]
-    _require_finite(is_rotation, f"a rotation quaternion {of}", where, tuple(pose[:4]))
+    require_finite(is_rotation, f"a rotation quaternion {of}", where, tuple(pose[:4]))
 
 
 def check_unit_quat(quat: Float64[np.ndarray, " 4"], where: str, fix: str) -> None:
@@ -131,7 +164,8 @@ def check_record(holds: bool, expected: str, where: str, found: object) -> None:
         raise format_error(expected, where, str(found))
 
 
-def _require_finite(holds: bool, expected: str, where: str, found: object) -> None:
+def require_finite(holds: bool, expected: str, where: str, found: object) -> None:
+    """Raise a ``NotFiniteError`` for a record unless a condition holds."""
     if not holds:
         raise NotFiniteError(f"{expected} in {where}", found=str(found), fix=COPY_AGAIN)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import NamedTuple
 from splatseed.depthmap import DepthKind
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError, SplatseedError
 from splatseed.findings import Finding, without_kinds
+from splatseed.io.bundler import find_bundler, read_bundler
 from splatseed.io.cleaning import clean_scene, outlier_findings
 from splatseed.io.colmap_model import find_model, nested_model, read_model, scene_model, scene_root
 from splatseed.io.copies import without_copies
@@ -30,11 +32,18 @@ from splatseed.io.depth_maps import (
 )
 from splatseed.io.files import StrPath, is_video, special_kind
 from splatseed.io.llff import is_llff, read_llff
+from splatseed.io.meshroom import find_meshroom, read_meshroom
+from splatseed.io.metashape import find_metashape, read_metashape
 from splatseed.io.nerfstudio import is_blender, read_blender, read_transforms_scene
+from splatseed.io.openmvg import find_openmvg, read_openmvg
+from splatseed.io.opensfm import find_opensfm, read_opensfm
 from splatseed.io.origin import recentered
+from splatseed.io.photogrammetry import largest
 from splatseed.io.picture import find_white
 from splatseed.io.ply import read_ply_float64, refuse_gaussians
 from splatseed.io.polycam import is_polycam, read_polycam
+from splatseed.io.pose_files import is_pose_folder, read_pose_folder
+from splatseed.io.realityscan import find_realityscan, read_realityscan
 from splatseed.io.record3d import (
     ARCHIVE,
     find_recorded_depths,
@@ -44,6 +53,7 @@ from splatseed.io.record3d import (
     read_record3d,
 )
 from splatseed.io.rgbd import find_tum_depths, is_replica, is_tum, load_rgbd, load_tum
+from splatseed.io.rtabmap import find_rtabmap, read_rtabmap
 from splatseed.io.scanner_app import is_scanner_app, read_scanner_app
 from splatseed.io.seeds import recall_seeds, restore_absent, with_recorded_masks
 from splatseed.io.split import with_listed_split
@@ -66,6 +76,39 @@ class Reader(NamedTuple):
     read: Callable[[Path], Scene]
 
 
+class Export(NamedTuple):
+    """A format of one file of cameras, of which a folder may hold several."""
+
+    files: str  # by which it is recognised, for messages
+    find: Callable[[Path], list[Path]]  # in a folder
+    read: Callable[[Path, Path], Scene]  # of a file and its scene's folder
+
+    def files_in(self, folder: Path) -> list[Path]:
+        """List such files; none where a folder or file may not be read."""
+        with suppress(OSError):
+            return self.find(folder)
+        return []
+
+    def recognises(self, folder: Path) -> bool:
+        """Whether a folder has such a file."""
+        return bool(self.files_in(folder))
+
+    def read_folder(self, folder: Path) -> Scene:
+        """Read the largest file of a folder."""
+        path, findings = largest(self.find(folder))
+        scene = self.read(path, folder)
+        return scene.replace(findings=(*findings, *scene.findings))
+
+
+EXPORTS = (
+    Export("Metashape's .xml", find_metashape, read_metashape),
+    Export("RealityScan's .csv", find_realityscan, read_realityscan),
+    Export("OpenSfM's reconstruction.json", find_opensfm, read_opensfm),
+    Export("Bundler's .out", find_bundler, read_bundler),
+    Export("OpenMVG's sfm_data.json", find_openmvg, read_openmvg),
+    Export("Meshroom's .sfm", find_meshroom, read_meshroom),
+    Export("RTAB-Map's _camera_poses.txt", find_rtabmap, read_rtabmap),
+)
 READERS = (
     Reader("poses_bounds.npy", is_llff, read_llff),
     Reader("traj.txt", is_replica, load_rgbd),
@@ -74,6 +117,12 @@ READERS = (
     Reader("Polycam's keyframes", is_polycam, read_polycam),
     Reader("Record3D's EXR_RGBD", is_record3d, read_record3d),
     Reader("Stray Scanner's rgb.mp4 with odometry.csv", is_stray, read_stray),
+    *(Reader(each.files, each.recognises, each.read_folder) for each in EXPORTS),
+    Reader(
+        "ScanNet's pose with color, 7-Scenes' frame-000000.pose.txt",
+        is_pose_folder,
+        read_pose_folder,
+    ),
 )
 """Tried in this order, after COLMAP models and transforms.json."""
 _INCOMPLETE = (
@@ -102,10 +151,11 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
         path: A folder with a COLMAP model (in ``sparse/0``, ``sparse``, ``colmap/sparse/0``, the
             folder itself or its subfolder ``0``), ``transforms.json``, ``transforms_train.json``
             and ``transforms_test.json``, LLFF's ``poses_bounds.npy``, an RGB-D capture
-            (``traj.txt``, or ``rgb.txt`` and ``groundtruth.txt``), or the export of a phone app
-            (3D Scanner App's ``frame_00000.json``, Polycam's ``keyframes``, Record3D's
-            ``EXR_RGBD``, Stray Scanner's ``rgb.mp4`` and ``odometry.csv``); or a ``.json``,
-            ``.ply`` or ``.r3d`` file (Record3D's).
+            (``traj.txt``, or ``rgb.txt`` and ``groundtruth.txt``, or a file per pose), the export
+            of a phone app (3D Scanner App's ``frame_00000.json``, Polycam's ``keyframes``,
+            Record3D's ``EXR_RGBD``, Stray Scanner's ``rgb.mp4`` and ``odometry.csv``), or a file of
+            cameras of Metashape, RealityScan, OpenSfM, Bundler, OpenMVG, Meshroom or RTAB-Map; or
+            that file, or a ``.json``, ``.ply`` or ``.r3d`` file (Record3D's).
             ``sparse`` takes precedence over ``transforms.json`` (except in an output of splatseed
             that has both), and that over ``colmap/sparse/0``.
         require_points: Raise for a scene without points; if False, its cloud is empty.
@@ -217,6 +267,9 @@ def _read_file(path: Path) -> Scene:
         points, exact = read_ply_float64(path)
         source = SceneSource("ply", path.parent, path)
         return recentered(Scene(points, source=source), exact)
+    for each in EXPORTS:
+        if suffix != ".ply" and path in each.files_in(path.parent):
+            return each.read(path, path.parent)
     if suffix == ".json":
         return read_transforms_scene(path)
     if _is_archive(path):

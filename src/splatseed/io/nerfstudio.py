@@ -26,8 +26,11 @@ from splatseed.findings import Finding
 from splatseed.io.camera_records import (
     MAX_ID,
     OPENCV_FROM_OPENGL,
+    Lens,
     NotFiniteError,
+    brown,
     check_enough,
+    fisheye,
     make_intrinsics,
     rigid_pose,
     unusable_findings,
@@ -333,8 +336,8 @@ def _camera(
     fl_x = _focal_length(where, values, "x", width, None)
     fl_y = _focal_length(where, values, "y", height, fl_x)
     center = _number(where, values, "cx", width / 2), _number(where, values, "cy", height / 2)
-    model, distortion = _lens(where, values)
-    return model, width, height, (fl_x, fl_y, *center, *distortion)
+    model, params = _lens(where, values, (fl_x, fl_y), center)
+    return model, width, height, params
 
 
 def _focal_length(
@@ -355,23 +358,21 @@ def _focal_length(
     return focal_length
 
 
-def _lens(where: str, values: Mapping[str, Any]) -> tuple[str, tuple[float, ...]]:
-    """Return COLMAP's model and distortion; COLMAP has no k4 for perspective lenses."""
+def _lens(
+    where: str, values: Mapping[str, Any], focal: tuple[float, float], center: tuple[float, float]
+) -> Lens:
+    """Return COLMAP's model and parameters; COLMAP has no k4 for perspective lenses."""
     model = lens_model(values)
     k1, k2, k3, k4, p1, p2 = (_number(where, values, key, 0.0) for key in DISTORTION)
     if model == _FISHEYE:
-        return _FISHEYE, (k1, k2, k3, k4)
+        return fisheye(focal, center, (k1, k2, k3, k4))
     if model not in _PERSPECTIVE:
         raise SceneFormatError(
             f"a perspective or OPENCV_FISHEYE camera_model in {where}",
             found=repr(model),
             fix="Convert the images to a perspective projection first.",
         )
-    if k3:
-        return "FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
-    if any((k1, k2, p1, p2)):
-        return "OPENCV", (k1, k2, p1, p2)
-    return "PINHOLE", ()
+    return brown(focal, center, (k1, k2, k3), (p1, p2))
 
 
 def _matrix(where: str, value: Any) -> Float64[np.ndarray, "3 4"]:

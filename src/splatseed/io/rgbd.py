@@ -82,7 +82,7 @@ def load_rgbd(root: StrPath) -> Scene:
             found="neither",
             fix='Write {"camera": {"w": 9, "h": 9, "fx": 9, "fy": 9, "cx": 9, "cy": 9}}.',
         )
-    intrinsics = _read_intrinsics(camera)
+    intrinsics = read_camera_file(camera)
     tracked = np.isfinite(poses).all(axis=(1, 2))
     images = []
     for i in np.flatnonzero(tracked).tolist():
@@ -187,7 +187,7 @@ def _tum_camera(root: Path) -> tuple[Intrinsics, tuple[Finding, ...]]:
     ROS default.
     """
     if (path := depth_maps.camera_file(root)) is not None:
-        return _read_intrinsics(path), ()
+        return read_camera_file(path), ()
     series = _SERIES.search(root.name) or _SERIES.search(root.resolve().name)
     fx, fy, cx, cy, *distortion = _COLOR_CAMERAS[series[1]] if series else _DEFAULT_CAMERA
     pinhole = (fx, fy, cx + 0.5, cy + 0.5)
@@ -202,7 +202,7 @@ def _tum_camera(root: Path) -> tuple[Intrinsics, tuple[Finding, ...]]:
     return Intrinsics(1, "PINHOLE", *_SIZE, pinhole), found
 
 
-def _read_intrinsics(path: Path) -> Intrinsics:
+def read_camera_file(path: Path) -> Intrinsics:
     """Read the pinhole camera of a camera file; the image corner is at (0, 0), as in COLMAP."""
     content = read_json(path)
     with translate_errors(

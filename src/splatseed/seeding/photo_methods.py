@@ -123,7 +123,7 @@ class Stereo(PhotographMethod):
             points = self.fill(scene, seeds, stereo, rng, timed, note)
         if on_stereo is not None:
             on_stereo(stereo)
-        if budget is None or not self.dense:
+        if budget is None or not self.dense or self.fills_pixels(scene, len(views)):
             return points
         first = Comparison(images, stereo, self.max_size, self.spacing, times.seconds())
 
@@ -161,6 +161,10 @@ class Stereo(PhotographMethod):
     ) -> PointCloud:
         """Add seeds where stereo found none; this method adds none."""
         return seeds
+
+    def fills_pixels(self, scene: Scene, num_views: int) -> bool:
+        """Whether ``fill`` makes seeds as dense as the pixels; this method does not."""
+        return False
 
 
 @dataclass(frozen=True)
@@ -213,12 +217,26 @@ class Auto(Stereo):
     ) -> PointCloud:
         """Add a seed in each cell that stereo leaves empty, at a measured depth if there is one."""
         known = PointCloud.concatenate(scene.points.originals, seeds)
+        if len(known) and self.fills_pixels(scene, len(stereo.views)):
+            from splatseed.seeding.few_photographs import pixel_seeds
+
+            num = len(stereo.views)
+            text = f"Few photographs ({num}): a seed every two pixels, at a depth that semi-global "
+            note(Finding("few-photographs", f"{text}matching infers for all of them.", "info"))
+            return pixel_seeds(stereo.views, known.xyz.astype(np.float64), progress)
         if self.depth_maps and in_scene_units(scene.depths):
             measured = self._from_maps(scene, stereo, known, progress, note)
             seeds = PointCloud.concatenate(seeds, measured)
             known = PointCloud.concatenate(known, measured)
         guessed = _cover(stereo.views, known, self.cell, rng, progress)
         return PointCloud.concatenate(seeds, guessed)
+
+    def fills_pixels(self, scene: Scene, num_views: int) -> bool:
+        """Whether photographs are so few that each pixel needs a depth; not if maps have it."""
+        from splatseed.seeding.few_photographs import MAX_PHOTOGRAPHS
+
+        measured = self.depth_maps and in_scene_units(scene.depths)
+        return 2 <= num_views <= MAX_PHOTOGRAPHS and not measured
 
     def _from_maps(
         self, scene: Scene, stereo: StereoResult, known: PointCloud, progress: Progress, note: Note

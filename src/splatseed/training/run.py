@@ -23,11 +23,13 @@ from splatseed.photos.view import View
 from splatseed.progress import Progress, silent
 from splatseed.scores import CurvePoint, EvalResult, TrainingResult
 from splatseed.splat.formats import read_gaussians, write_gaussians
+from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.pictures import picture_names, write_comparison
 from splatseed.splat.rendering import ModelRenderer
 from splatseed.splat.training_frame import TrainingFrame
 from splatseed.training.device import device_name
 from splatseed.training.folder import Record, RunFolder, write_curve_csv, write_curve_png
+from splatseed.training.margins import has_margins, with_margins
 from splatseed.training.parameters import gaussians_of, take_mean
 from splatseed.training.settings import TrainSettings
 from splatseed.training.state import TrainState, save_checkpoint
@@ -61,7 +63,7 @@ class TrainingRun:
         self.folder, self.settings, self.state, self.frame = folder, settings, state, frame
         self._board: Any = None  # TensorBoard's writer, if requested
         self._saved, self._saved_step = time.monotonic(), state.step or None
-        self._test_views = views[1]
+        self._train_views, self._test_views = views
         train, test = ([frame.view(view) for view in part] for part in views)
         self._pictures = picture_names(view.name for view in test)
         self.trainer = Trainer(state, settings, train, test, self._on_record)
@@ -134,9 +136,7 @@ class TrainingRun:
         with self.translate_errors():
             progress("score", 0.0)
             folder.claim([folder.renders / name for name in self._pictures.values()])
-            write_gaussians(
-                folder.gaussians, self.frame.gaussians_to_world(gaussians_of(state.params))
-            )
+            write_gaussians(folder.gaussians, self._model())
             # The file that the user gets is scored, read back.
             world = read_gaussians(folder.gaussians)
             render = ModelRenderer(world, self.frame, self.trainer.device).image
@@ -160,6 +160,14 @@ class TrainingRun:
             write_json(folder.metrics, result.to_dict())  # last: the run has finished
             folder.checkpoint.unlink(missing_ok=True)
         return result
+
+    def _model(self) -> Gaussians:
+        """Return the Gaussians in the scene's frame; with margins, if photographs are few."""
+        model = self.frame.gaussians_to_world(gaussians_of(self.state.params))
+        views, cap = self._train_views, self.settings.cap
+        if not has_margins(self.settings, views):
+            return model
+        return with_margins(model, self.frame, views, cap, self.trainer.device)
 
     def _draw(
         self, view: View, render: Float32[np.ndarray, "H W 3"], errors: Float32[np.ndarray, "H W"]

@@ -42,7 +42,7 @@ MATCHING = StereoSettings(grid=2, sweeps=6, tolerance=0.03, max_cost=0.4)
 
 def coarse_stereo(views: Sequence[View], seed: int, progress: Progress) -> Visibility:
     """Find points by stereo on downsampled copies of two or more photographs."""
-    small = [_downsampled(view) for view in views]
+    small = [downsampled(view, COARSE.side) for view in views]
     quantiles = _inverse_depth_quantiles(small, seed, progress)
     # Sources share the hypothetical points that a view may see, at good angles.
     xyz, seen = _hypothetical_points(small, quantiles)
@@ -81,9 +81,9 @@ def prior_from_baseline(
     return DepthPrior.from_range(COARSE.min_parallax / parallax, views[i].width / parallax)
 
 
-def _downsampled(view: View) -> View:
-    """Downsample a view by a whole factor to about ``COARSE.side`` pixels."""
-    factor = max(1, round(max(view.width, view.height) / COARSE.side))
+def downsampled(view: View, side: int) -> View:
+    """Downsample a view by a whole factor to about ``side`` pixels on its longer side."""
+    factor = max(1, round(max(view.width, view.height) / side))
     image = block_means(view.photograph, factor)
     K = scaled(view.K, 1 / factor)
     mask = None

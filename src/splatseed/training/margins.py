@@ -1,0 +1,193 @@
+"""Margins: what lies just past the edges of the photographs, continued from what they show.
+
+No photograph trains what it does not see, so that a model of few photographs ends in black at their
+frames. After the last step each training view is rendered, and its colours and inverse depths are
+continued beyond its frame, the smoother the farther out. A Gaussian is added for every few pixels
+there, unless it lies within another frame, or nearer to it. Promise: what is within a frame is left
+alone but for Gaussians that reach across its edge; the same model gives the same bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Float64
+
+from splatseed.camera import Camera
+from splatseed.photos.view import NO_PIXELS, View
+from splatseed.projection import scaled
+from splatseed.seeding.few_photographs import MAX_PHOTOGRAPHS
+from splatseed.splat.gaussians import SH_C0, Gaussians
+from splatseed.splat.rendering import ModelRenderer
+from splatseed.splat.training_frame import TrainingFrame
+from splatseed.training.settings import TrainSettings
+
+SIDE = 512
+"""Longer side, about, at which views are rendered, in pixels."""
+WIDTH = 0.4
+"""Width of the margin on each side, in longer sides of the frame."""
+STEP = 4
+"""Minimum distance of Gaussians, in pixels of the rendered view."""
+SHARE = 0.1
+"""Maximum number of Gaussians of margins, as a fraction of the cap."""
+SIZE = 0.7  # standard deviation of a Gaussian, and its minimum distance from the frame, in steps
+OPACITY = 0.9
+
+
+def has_margins(settings: TrainSettings, views: Sequence[View]) -> bool:
+    """Whether the model of a run gets margins: with few photographs that show all there is.
+
+    Not of 3DGS as published, of a run that continues one, or of objects cut out.
+    """
+    cut_out = any(view.empty is not None or view.opacity is not None for view in views)
+    few = len(views) <= MAX_PHOTOGRAPHS
+    return few and not settings.as_3dgs and settings.start is None and not cut_out
+
+
+def with_room(settings: TrainSettings) -> TrainSettings:
+    """Return settings whose cap leaves room for the margins."""
+    cap = settings.cap
+    return settings if cap is None else replace(settings, cap_max=max(2, round((1 - SHARE) * cap)))
+
+
+def with_margins(
+    model: Gaussians,
+    frame: TrainingFrame,
+    views: Sequence[View],
+    cap: int | None,
+    device: torch.device | None = None,
+) -> Gaussians:
+    """Add the margins of the training views to a model; both are in the scene's frame.
+
+    With a ``cap`` on the number of Gaussians, the faintest make room if they have to.
+    """
+    renderer = ModelRenderer(model, frame, device)
+    small = [_reduced(view) for view in views]
+    depths = [renderer.depth(view) for view in small]
+    values = [_continued(renderer.color(v), d) for v, d in zip(small, depths, strict=True)]
+    limit, step = np.inf if cap is None else SHARE * cap, STEP
+    while True:
+        parts = [_margin(i, small, values[i], step) for i in range(len(small))]
+        xyz, colors, sizes = (np.concatenate(each) for each in zip(*parts, strict=True))
+        if len(xyz) <= limit:
+            break
+        step += 1
+    if cap is not None and len(model) + len(xyz) > cap:
+        order = np.argsort(-model.opacities, kind="stable")[: cap - len(xyz)]
+        model = model.select(np.sort(order))
+    added = {
+        "means": xyz,
+        "scales": np.repeat(np.log(sizes)[:, None], 3, axis=1),
+        "quats": np.tile([1.0, 0.0, 0.0, 0.0], (len(xyz), 1)),
+        "opacities": np.full(len(xyz), np.log(OPACITY / (1 - OPACITY))),
+        "sh0": ((colors - 0.5) / SH_C0)[:, None],
+        "shN": np.zeros((len(xyz), *model.shN.shape[1:])),
+    }
+    grown = {
+        name: np.concatenate([array, added[name].astype(np.float32)])
+        for name, array in model.arrays().items()
+    }
+    return Gaussians(**grown, antialiased=model.antialiased)
+
+
+def _reduced(view: View) -> View:
+    factor = max(1, round(max(view.width, view.height) / SIDE))
+    width, height = view.width // factor, view.height // factor
+    camera = Camera(scaled(view.K, 1 / factor), width, height, view.cam_from_world)
+    return View(view.name, NO_PIXELS, camera, near=view.near)
+
+
+def _continued(
+    color: Float32[np.ndarray, "H W 3"], depth: Float32[np.ndarray, "H W"]
+) -> Float64[np.ndarray, "h w 4"]:
+    """Return colours and inverse depths of a view and of a margin around it."""
+    around = _width(depth.shape)
+    known = np.pad(depth > 0, around)
+    inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0)
+    values = np.concatenate([color, inverse[..., None]], axis=2)
+    values = np.pad(values, ((around, around), (around, around), (0, 0)))
+    return continued(values, known) if known.any() else values
+
+
+def _width(shape: tuple[int, ...]) -> int:
+    return round(WIDTH * max(shape))
+
+
+def _margin(
+    i: int, views: Sequence[View], values: Float64[np.ndarray, "h w 4"], step: int
+) -> tuple[Float64[np.ndarray, "M 3"], Float64[np.ndarray, "M 3"], Float64[np.ndarray, " M"]]:
+    """Return positions, colours and sizes of the Gaussians beyond the frame of view i."""
+    camera = views[i].camera
+    around = _width((camera.height, camera.width))
+    row, column = np.mgrid[step // 2 : len(values) : step, step // 2 : values.shape[1] : step]
+    uv = np.stack([column.ravel(), row.ravel()], axis=1) + 0.5 - around
+    continuation = values[row.ravel(), column.ravel()]
+    colors, inverse = continuation[:, :3], continuation[:, 3]
+    beyond = _beyond(uv, camera)
+    used = (beyond > SIZE * step) & (inverse > 0)
+    uv, z, beyond = uv[used], 1.0 / inverse[used], beyond[used]
+    xyz = camera.unproject(uv, z)
+    kept = _unseen(xyz, i, views, beyond)
+    return xyz[kept], colors[used][kept], SIZE * step * z[kept] / camera.K[0, 0]
+
+
+def _unseen(
+    xyz: Float64[np.ndarray, "M 3"],
+    i: int,
+    views: Sequence[View],
+    beyond: Float64[np.ndarray, " M"],
+) -> Bool[np.ndarray, " M"]:
+    """Select points that are in no other frame, and nearest to that of view i."""
+    kept = np.ones(len(xyz), bool)
+    for j, other in enumerate(views):
+        if j != i:
+            uv, z = other.camera.project(xyz)
+            distance = _beyond(uv, other.camera)
+            kept &= (z <= 0) | ((distance > 0) & (distance >= beyond))
+    return kept
+
+
+def _beyond(uv: Float[np.ndarray, "M 2"], camera: Camera) -> Float64[np.ndarray, " M"]:
+    """Return how far pixels lie outside a frame, in its pixels; below 0 within it."""
+    return np.asarray(np.maximum(-uv, uv - [camera.width, camera.height]).max(axis=1))
+
+
+def continued(
+    values: Float64[np.ndarray, "H W C"], known: Bool[np.ndarray, "H W"]
+) -> Float64[np.ndarray, "H W C"]:
+    """Fill unknown pixels from the means of ever larger blocks of known ones, interpolated.
+
+    Source: pull-push, S. J. Gortler et al., The Lumigraph (1996). At least one pixel is known.
+    """
+    if known.all():
+        return values
+    height, width, count = values.shape
+    padding = (0, height % 2), (0, width % 2)
+    counts = np.pad(known, padding).astype(np.float64)
+    weighted = np.pad(values * known[..., None], (*padding, (0, 0)))
+    rows, columns = counts.shape[0] // 2, counts.shape[1] // 2
+    number = counts.reshape(rows, 2, columns, 2).sum(axis=(1, 3))
+    total = weighted.reshape(rows, 2, columns, 2, count).sum(axis=(1, 3))
+    means = total / np.maximum(number, 1.0)[..., None]
+    coarse = continued(means, number > 0)
+    lower, upper, part = zip(
+        *(_between(length, size) for length, size in ((height, rows), (width, columns))),
+        strict=True,
+    )
+    across = part[1][None, :, None]
+    above, below = (
+        coarse[row][:, lower[1]] * (1 - across) + coarse[row][:, upper[1]] * across
+        for row in (lower[0], upper[0])
+    )
+    down = part[0][:, None, None]
+    return np.where(known[..., None], values, above * (1 - down) + below * down)
+
+
+def _between(length: int, size: int) -> tuple[np.ndarray, np.ndarray, Float64[np.ndarray, " L"]]:
+    """Return the blocks, of two pixels, between whose centres pixels lie, and where."""
+    place = np.clip((np.arange(length) + 0.5) / 2 - 0.5, 0, size - 1)
+    lower = place.astype(np.int64)
+    return lower, np.minimum(lower + 1, size - 1), place - lower
