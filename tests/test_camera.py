@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as hnp
 
 from splatseed.camera import (
     CAMERA_MODELS,
-    PANORAMA,
+    MODELS,
     Camera,
     Intrinsics,
     quat_from_rotation,
@@ -83,8 +83,15 @@ def test_models_match_colmap(name):
 def test_all_of_pycolmaps_models_are_known():
     ids = {str(name): int(model) for name, model in pycolmap.CameraModelId.__members__.items()}
     del ids["INVALID"]
-    known = (*CAMERA_MODELS.values(), PANORAMA)
-    assert {model.name: model.model_id for model in known} == ids
+    assert {model.name: model.model_id for model in MODELS.values()} == ids
+
+
+def test_a_panorama_has_a_size_and_no_matrix():
+    panorama = Intrinsics(1, "EQUIRECTANGULAR", 64, 32, (64.0, 32.0))
+    assert panorama.is_panorama
+    assert panorama.has_distortion
+    assert np.isnan(panorama.K).all()
+    assert panorama.resized(32, 16).params == (32, 16)
 
 
 def test_projection_matches_pycolmap(rng):
@@ -101,7 +108,7 @@ def test_projection_matches_pycolmap(rng):
     ("model", "params", "named"),
     [
         ("POLAROID", (1.0,) * 4, "'POLAROID'"),
-        ("EQUIRECTANGULAR", (9.0, 5.0), "EQUIRECTANGULAR"),
+        ("EQUIRECTANGULAR", (9.0, 5.0, 1.0), "2 parameters; found 3"),
         ("PINHOLE", (1.0,) * 3, "4 parameters; found 3"),
     ],
 )

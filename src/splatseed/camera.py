@@ -54,7 +54,10 @@ CAMERA_MODELS: dict[str, CameraModel] = {
 }
 """COLMAP 4.2's camera models by name, without panoramas."""
 PANORAMA = CameraModel(17, "EQUIRECTANGULAR", 2, 0)
-"""COLMAP's model of full panoramas, which no pinhole camera can show."""
+"""COLMAP's model of full panoramas; its parameters are their width and height. No pinhole camera
+can show them: ``load_scene`` refuses them unless they are to be cut (``sfm.panoramas``)."""
+MODELS = {**CAMERA_MODELS, PANORAMA.name: PANORAMA}
+"""All of COLMAP 4.2's camera models."""
 
 
 _TWO_FOCAL = {
@@ -79,24 +82,16 @@ class Intrinsics:
     """
 
     camera_id: int
-    model: str  # a key of ``CAMERA_MODELS``
+    model: str  # a key of ``MODELS``
     width: int  # pixels
     height: int
     params: tuple[float, ...]  # in COLMAP's order; pixels for focal lengths and centre
 
     def __post_init__(self) -> None:
-        model = CAMERA_MODELS.get(self.model)
-        if self.model == PANORAMA.name:
-            raise SceneFormatError(
-                f"camera {self.camera_id} to be a perspective or fisheye camera",
-                found=f"{self.model}, a panorama",
-                fix="Cut each panorama into perspective views and find their poses, as COLMAP's "
-                "panorama_sfm.py does, then use the scene with these views.",
-            )
+        model = MODELS.get(self.model)
         if model is None:
             raise SceneFormatError(
-                f"camera {self.camera_id} to have one of COLMAP's models "
-                f"({', '.join(CAMERA_MODELS)})",
+                f"camera {self.camera_id} to have one of COLMAP's models ({', '.join(MODELS)})",
                 found=f"{self.model!r}",
                 fix="Undistort the scene to PINHOLE (colmap image_undistorter) and try again.",
             )
@@ -118,12 +113,17 @@ class Intrinsics:
         return self.model.endswith("FISHEYE")
 
     @property
+    def is_panorama(self) -> bool:
+        """Whether it shows all directions, by longitude and latitude."""
+        return self.model == PANORAMA.name
+
+    @property
     def has_distortion(self) -> bool:
-        """Whether lines are curved: always for a fisheye, else if a coefficient is not 0."""
-        terms = self.params[CAMERA_MODELS[self.model].num_focal + 2 :]
+        """Whether lines are curved: always for a fisheye or panorama, else by the coefficients."""
+        terms = self.params[MODELS[self.model].num_focal + 2 :]
         if self.model == "EUCM":
             terms = terms[:1]  # without alpha, beta has no effect
-        return self.is_fisheye or any(terms)
+        return self.is_fisheye or self.is_panorama or any(terms)
 
     @property
     def pinhole(self) -> Intrinsics:
@@ -133,7 +133,9 @@ class Intrinsics:
 
     @property
     def K(self) -> Float64[np.ndarray, "3 3"]:  # noqa: N802  (the field's name)
-        """The pinhole matrix in pixels, without distortion."""
+        """The pinhole matrix in pixels, without distortion; NaN for a panorama, which has none."""
+        if self.is_panorama:
+            return np.full((3, 3), np.nan)
         num_focal = CAMERA_MODELS[self.model].num_focal
         fx, fy = self.params[0], self.params[num_focal - 1]
         cx, cy = self.params[num_focal : num_focal + 2]
@@ -149,6 +151,9 @@ class Intrinsics:
         if (width, height) == (self.width, self.height):
             return self
         x, y, name = width / self.width, height / self.height, self.model
+        if self.is_panorama:
+            params = (self.params[0] * x, self.params[1] * y)
+            return replace(self, width=width, height=height, params=params)
         num_focal, focal = CAMERA_MODELS[name].num_focal, self.params[:1]
         terms = self.params[num_focal + 2 :]
         if num_focal == 2:

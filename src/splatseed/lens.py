@@ -51,8 +51,10 @@ def undistort_command(scene: Path) -> str:
 
 
 def undistorted_folder(scene: Path) -> Path:
-    """Return the output folder of ``undistort_command``, next to the scene."""
-    return scene.with_name(f"{scene.resolve().name}_undistorted")
+    """Return the output folder of ``undistort_command``, next to the scene's folder."""
+    folder = scene.parent if scene.is_file() else scene
+    named = folder if folder.name else folder.absolute()  # "." has no name
+    return named.with_name(f"{folder.resolve().name}_undistorted")
 
 
 def project_rays(lens: Intrinsics, xy: Float64[np.ndarray, "*B 2"]) -> Float64[np.ndarray, "*B 2"]:

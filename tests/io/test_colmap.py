@@ -83,17 +83,27 @@ def test_every_camera_model_is_read_in_both_forms(name, tmp_path):
 @pytest.mark.parametrize(
     ("model_id", "says"),
     [
-        (17, r"camera 7 .*cameras.bin.*EQUIRECTANGULAR.*Cut each panorama"),
         (18, r"cameras.bin, record 1 of 1.*18, of a newer COLMAP.*image_undistorter"),
         (-1, r"id of a COLMAP camera model.*Copy the file again"),
         (2**30, r"id of a COLMAP camera model.*Copy the file again"),
     ],
 )
-def test_models_without_a_pinhole_or_of_the_future_are_no_damage(model_id, says, tmp_path):
+def test_models_of_the_future_are_no_damage(model_id, says, tmp_path):
     path = tmp_path / "cameras.bin"
     path.write_bytes(struct.pack("<QIiQQ2d", 1, 7, model_id, 64, 32, 64.0, 32.0))
     with pytest.raises(SceneFormatError, match=says):
         colmap.read_cameras(path)
+
+
+def test_panoramas_are_read(tmp_path):
+    """As COLMAP writes them, and as it did before its release."""
+    (tmp_path / "cameras.bin").write_bytes(struct.pack("<QIiQQ2d", 1, 7, 17, 64, 32, 64.0, 32.0))
+    (tmp_path / "cameras.txt").write_text("7 SPHERICAL 64 32 64 32\n")
+    expected = (Intrinsics(7, "EQUIRECTANGULAR", 64, 32, (64.0, 32.0)),)
+    for suffix in ("bin", "txt"):
+        assert colmap.read_cameras(tmp_path / f"cameras.{suffix}") == expected
+    colmap.write_cameras(tmp_path / "again.bin", expected)
+    assert (tmp_path / "again.bin").read_bytes() == (tmp_path / "cameras.bin").read_bytes()
 
 
 # COLMAP itself is the judge of what its formats say.

@@ -249,7 +249,7 @@ DIAGONALS = ([2.0, 2, 2, 2], [1.0, 1, -1, 1], [0.0, 1, 1, 1])
     ("change", "frame"),
     [
         *(({"fl_x": value}, {}) for value in (None, -5, 0, float("nan"))),
-        *(({"w": 0}, {}), ({"frames": []}, {}), ({"camera_model": "EQUIRECTANGULAR"}, {})),
+        *(({"w": 0}, {}), ({"frames": []}, {}), ({"camera_model": "ORTHOGRAPHIC"}, {})),
         ({"applied_transform": [[1, 0], [0, 1]]}, {}),
         *(({}, {"file_path": value}) for value in (None, "images/left/image000.jpg")),  # used
         ({}, {"transform_matrix": None}),

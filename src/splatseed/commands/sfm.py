@@ -34,6 +34,7 @@ from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Masks, Scene
 from splatseed.sfm import MatcherName, Settings, SfmReport, reconstruct
 from splatseed.sfm.first_look import FIRST_LOOK, NEIGHBOURS, STAGE
+from splatseed.sfm.panoramas import PanoramasName
 from splatseed.sfm.photos import pick_frames
 from splatseed.text import counted, name_some, quoted, visible
 
@@ -69,6 +70,11 @@ class Options:
     which has no distortion, with fewer than 16 photographs."""
     shared_camera: bool = True
     """Photographs of the same size and EXIF lens share a camera; not used with --poses-from."""
+    panoramas: PanoramasName = "auto"
+    """Which photographs are equirectangular panoramas (360 degrees), each to be cut into six: those
+    recognised, all or none; not used with --poses-from."""
+    mask_below: float = 0.0
+    """Mask panoramas within this angle of straight down, in degrees, where the photographer is."""
     device: DeviceName = "auto"
     """Device for features and matching; auto takes a GPU if pycolmap can use one."""
     seed: int = 0
@@ -91,7 +97,7 @@ def run(arguments: list[str]) -> None:
     poses = "the folder of photographs with poses"
     lens = [
         f"--{name.replace('_', '-')}"
-        for name in ("camera_model", "shared_camera")
+        for name in ("camera_model", "shared_camera", "panoramas", "mask_below")
         if getattr(options, name) != getattr(Options, name)
     ]
     refuse(
@@ -141,6 +147,8 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
             "camera_model": options.camera_model,
             "shared_camera": options.shared_camera,
             "partial": options.partial,
+            "panoramas": options.panoramas,
+            "mask_below": options.mask_below,
         }
     else:
         stages = [*(["refinement"] if options.refine_poses else []), "triangulation"]

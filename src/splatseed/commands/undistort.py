@@ -17,6 +17,7 @@ from splatseed.io.depth_maps import DepthFiles
 from splatseed.io.load import depths_beside
 from splatseed.io.seeds import was_upsampled
 from splatseed.io.staging import check_output
+from splatseed.photos.panorama import FACES
 from splatseed.requirements import require
 from splatseed.seeding.advice import is_distorted
 from splatseed.sfm import undistort
@@ -31,6 +32,8 @@ class Options:
     """A scene with photographs, in any layout."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The scene folder to write, in COLMAP's layout."""
+    mask_below: float = 0.0
+    """Mask panoramas within this angle of straight down, in degrees, where the photographer is."""
     overwrite: bool = False
     """Replace an output folder that splatseed undistort wrote before."""
 
@@ -43,19 +46,25 @@ def run(arguments: list[str]) -> None:
     check_output(output, kind="undistort", overwrite=overwrite, protect=[options.scene])
     with stage_display(lines=True) as clock:
         clock("read", 0.0)
-        scene = load_scene(options.scene, require_points=False)
-        clock.count(len(scene.images), "photographs", "undistortion")
-        report = undistort(scene, output, overwrite=overwrite, on_progress=clock)
+        scene = load_scene(options.scene, require_points=False, panoramas=True)
+        whole = sum(image.intrinsics.is_panorama for image in scene.images)
+        clock.count(len(scene.images) + (len(FACES) - 1) * whole, "photographs", "undistortion")
+        report = undistort(
+            scene, output, mask_below=options.mask_below, overwrite=overwrite, on_progress=clock
+        )
     counts = [("images", f"{report.registered:,}"), ("points", f"{report.num_points:,}")]
     print_pairs("splatseed undistort", [*counts, ("output", str(output))])
     add_results(output=output, images=report.registered, points=report.num_points)
-    print_note(*without_kinds(scene.findings, "lens-distortion"))
+    print_note(*report.findings, *without_kinds(scene.findings, "lens-distortion"))
     maps = scene.depths or depths_beside(scene)
     if isinstance(maps, DepthFiles) and maps:
         folder = quoted(os.path.commonpath([path.parent for path in maps.paths.values()]))
         are = agreeing(len(maps), "is", "are")
-        text = f"Its {counted(len(maps), 'depth map')} {are} not in the output: name them to "
-        print_note(Finding("depth-maps-left-out", f"{text}upsample by --depth {folder}."))
+        text = f"Its {counted(len(maps), 'depth map')} {are} not in the output"
+        how = (
+            ", as panoramas have none" if whole else f": name them to upsample by --depth {folder}"
+        )
+        print_note(Finding("depth-maps-left-out", f"{text}{how}."))
     if not is_distorted(scene):
         text = "No camera had distortion: the photographs are copies."
         print_note(Finding("no-distortion", text, "info"))

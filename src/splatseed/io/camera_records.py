@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Float64
 
-from splatseed.camera import CAMERA_MODELS, Intrinsics, quat_from_rotation, rotation_from_quat
+from splatseed.camera import MODELS, Intrinsics, quat_from_rotation, rotation_from_quat
 from splatseed.errors import SceneFormatError
 from splatseed.findings import Finding
 from splatseed.io.files import COPY_AGAIN
@@ -54,9 +54,10 @@ def make_intrinsics(
     except SceneFormatError as error:
         expected = f"{error.expected} in {where}"
         raise SceneFormatError(expected, found=error.found, fix=error.fix) from None
-    lengths = camera.params[: CAMERA_MODELS[model].num_focal]
+    what, count = ("size", 2) if camera.is_panorama else ("focal length", MODELS[model].num_focal)
+    lengths = camera.params[:count]
     found = ", ".join(f"{each:g}" for each in lengths)
-    require_finite(min(lengths) > 0, "a focal length above 0", where, found)
+    require_finite(min(lengths) > 0, f"a {what} above 0", where, found)
     return camera
 
 

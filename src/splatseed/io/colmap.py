@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Int64, UInt8
 
-from splatseed.camera import CAMERA_MODELS, PANORAMA, Intrinsics
+from splatseed.camera import MODELS, PANORAMA, Intrinsics
 from splatseed.errors import OutputError, PointCloudError, SceneFormatError
 from splatseed.io.camera_records import (
     MAX_ID,
@@ -35,6 +35,8 @@ from splatseed.scene import NO_POINT, Image, Observations, Tracks
 UNKNOWN_ERROR = -1.0
 """COLMAP's reprojection error of a point without one."""
 
+_SPHERICAL = "SPHERICAL"
+"""The name of COLMAP's model of panoramas before its release."""
 _MAX_MODEL_ID = 100
 """Unknown camera model ids below this are reported as newer models, others as damage."""
 _COUNT = struct.Struct("<Q")
@@ -147,11 +149,10 @@ def _binary_cameras(path: Path) -> Iterator[tuple[Any, ...]]:
     reader = ByteReader(path)
     for where in reader.records(_CAMERA.size, "cameras"):
         camera_id, model_id, *size = reader.unpack(_CAMERA)
-        known = (*CAMERA_MODELS.values(), PANORAMA)
-        model = next((m for m in known if m.model_id == model_id), None)
-        if model is None and len(known) <= model_id < _MAX_MODEL_ID:
+        model = next((m for m in MODELS.values() if m.model_id == model_id), None)
+        if model is None and len(MODELS) <= model_id < _MAX_MODEL_ID:
             raise SceneFormatError(
-                f"the id of a camera model of COLMAP 4.2 or older, 0 to {len(known) - 1}, in "
+                f"the id of a camera model of COLMAP 4.2 or older, 0 to {len(MODELS) - 1}, in "
                 f"{where}",
                 found=f"{model_id}, of a newer COLMAP",
                 fix="Undistort the scene to PINHOLE with that COLMAP (colmap image_undistorter).",
@@ -233,7 +234,7 @@ def write_cameras(path: StrPath, intrinsics: Sequence[Intrinsics]) -> None:
         file.write(_COUNT.pack(len(intrinsics)))
         for camera in intrinsics:
             where = f"camera {camera.camera_id}"
-            head = (CAMERA_MODELS[camera.model].model_id, camera.width, camera.height)
+            head = (MODELS[camera.model].model_id, camera.width, camera.height)
             file.write(_pack(_CAMERA, where, camera.camera_id, *head))
             file.write(np.array(camera.params, "<f8").tobytes())
 
@@ -321,7 +322,8 @@ def _text_cameras(path: Path) -> Iterator[tuple[Any, ...]]:
     for where, line in _data_lines(path):
         row = line.split()
         with _parsed(where, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", row):
-            record = (int(row[0]), row[1], int(row[2]), int(row[3]), tuple(map(float, row[4:])))
+            model = PANORAMA.name if row[1] == _SPHERICAL else row[1]
+            record = (int(row[0]), model, int(row[2]), int(row[3]), tuple(map(float, row[4:])))
         yield where, *record
 
 

@@ -5,7 +5,7 @@ The root holds no PLY, because Brush loads any that it finds there.
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Container, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -77,10 +77,14 @@ def write_split(scene: Scene, folder: Path) -> None:
     copy_files(scene.source.model_dir, MODEL_LISTS, folder / "sparse" / "0")
     if scene.listed is None or any((folder / name).exists() for name in ROOT_LISTS):
         return
-    train, test = scene.split()
-    for part, images in zip(ROOT_LISTS, (train, test, test), strict=False):  # val: test, too
-        text = "".join(f"{image.name}\n" for image in images)
-        (folder / part).write_text(text, "utf-8")
+    train, test = ([image.name for image in part] for part in scene.split())
+    write_lists(folder, train, test)
+
+
+def write_lists(folder: Path, train: Sequence[str], test: Sequence[str]) -> None:
+    """Write lists of training and test images as nerfstudio does."""
+    for part, names in zip(ROOT_LISTS, (train, test, test), strict=False):  # val: test, too
+        (folder / part).write_text("".join(f"{name}\n" for name in names), "utf-8")
 
 
 def _rigs(

@@ -59,8 +59,9 @@ from splatseed.io.seeds import recall_seeds, restore_absent, with_recorded_masks
 from splatseed.io.split import with_listed_split
 from splatseed.io.staging import MANIFEST, read_manifest
 from splatseed.io.stray import is_stray, read_stray
+from splatseed.lens import undistort_command
 from splatseed.scene import Scene, SceneSource
-from splatseed.text import name_some, quoted
+from splatseed.text import counted, name_some, quoted
 
 _TRANSFORMS, _BLENDER = "transforms.json", "transforms_train.json"
 _MAX_LEVELS_UP = 3
@@ -144,7 +145,7 @@ _TRIANGULATE = (
 )
 
 
-def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
+def load_scene(path: StrPath, *, require_points: bool = True, panoramas: bool = False) -> Scene:
     """Load a scene.
 
     Args:
@@ -159,6 +160,8 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
             ``sparse`` takes precedence over ``transforms.json`` (except in an output of splatseed
             that has both), and that over ``colmap/sparse/0``.
         require_points: Raise for a scene without points; if False, its cloud is empty.
+        panoramas: Accept equirectangular cameras, which only ``sfm.undistort`` can use: their
+            ``K`` is NaN.
 
     Returns:
         The scene, with cameras in OpenCV axes. Coordinates are those of its files, minus
@@ -168,7 +171,7 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
 
     Raises:
         SceneNotFoundError: No scene there, or it has no points.
-        SceneFormatError: A file is malformed.
+        SceneFormatError: A file is malformed, or a photograph a panorama.
     """
     path = Path(path)
     try:
@@ -188,6 +191,13 @@ def load_scene(path: StrPath, *, require_points: bool = True) -> Scene:
             found=f"{error.strerror or type(error).__name__} at {error.filename or path}",
             fix="Check that you may read the folder and its files.",
         ) from None
+    whole = [image.name for image in scene.images if image.intrinsics.is_panorama]
+    if whole and not panoramas:
+        raise SceneFormatError(
+            f"perspective or fisheye photographs in {path}",
+            found=f"{counted(len(whole), 'equirectangular panorama')} ({name_some(whole, 3)})",
+            fix=f"Cut them into perspective photographs first: {undistort_command(path)}.",
+        )
     if require_points and not len(scene.points):
         fix = _TRIANGULATE if scene.images else "Choose a scene or a PLY with points."
         raise SceneNotFoundError(f"points in {path}", found="none", fix=fix)

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from splatseed.camera import Intrinsics
+from splatseed.camera import PANORAMA, Intrinsics
 from splatseed.errors import SceneFormatError
 from splatseed.findings import Finding
 from splatseed.io.camera_records import (
@@ -68,6 +68,8 @@ from splatseed.text import counted
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _FISHEYE = "OPENCV_FISHEYE"
+_PANORAMAS = ("EQUIRECTANGULAR", "SPHERICAL")
+"""Names of lens models of full panoramas; nerfstudio and LichtFeld Studio know the first."""
 UNDISTORTED = ("PINHOLE", "SIMPLE_PINHOLE")
 LENS_MODELS = frozenset({"camera_model", "is_fisheye"})
 """Keys of which either states the lens model."""
@@ -333,6 +335,8 @@ def _camera(
         expected = f"a readable image, or w and h to be, in {where}"
         with translate_errors(file, expected, fix=FIX), open_file(file) as opened:
             width, height = open_picture(opened).size
+    if lens_model(values) in _PANORAMAS:  # programs differ in what they write as its focal length
+        return PANORAMA.name, width, height, (float(width), float(height))
     fl_x = _focal_length(where, values, "x", width, None)
     fl_y = _focal_length(where, values, "y", height, fl_x)
     center = _number(where, values, "cx", width / 2), _number(where, values, "cy", height / 2)
@@ -368,7 +372,7 @@ def _lens(
         return fisheye(focal, center, (k1, k2, k3, k4))
     if model not in _PERSPECTIVE:
         raise SceneFormatError(
-            f"a perspective or OPENCV_FISHEYE camera_model in {where}",
+            f"a perspective, {_FISHEYE} or {_PANORAMAS[0]} camera_model in {where}",
             found=repr(model),
             fix="Convert the images to a perspective projection first.",
         )

@@ -17,11 +17,14 @@ from typing import Any, Literal, TypeAlias, TypeVar, get_args
 import numpy as np
 
 from splatseed import errors
+from splatseed.camera import Intrinsics
+from splatseed.photos.panorama import FACES
 from splatseed.progress import Progress
 from splatseed.requirements import install_command
 from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Image
 from splatseed.sfm.cameras import SharedCamera
+from splatseed.sfm.panoramas import PanoramaRig
 from splatseed.sfm.photos import COPIES
 from splatseed.sfm.work_folder import DATABASE, WorkFolder
 from splatseed.text import numeric_order
@@ -106,6 +109,7 @@ class ColmapRun:
     on_progress: Progress
     kept: WorkFolder | None = None  # keeps features, matches and models after a failure
     holds_focal: bool = False  # keep the focal lengths that mapping starts from
+    rigs: Sequence[PanoramaRig] = ()  # whose lenses and relative poses are known
     seconds: dict[str, float] = field(default_factory=dict)  # wall time of finished stages
 
     @property
@@ -155,16 +159,59 @@ def guessed_model(run: ColmapRun, cameras: Sequence[SharedCamera], camera_model:
     """Make a model without poses; focal lengths are from EXIF or defaults."""
     pycolmap, model = run.pycolmap, run.pycolmap.Reconstruction()
     options = pycolmap.ImageReaderOptions(camera_model=camera_model)
-    ids: dict[str, int] = {}
+    ids: dict[str, int] = {name: i for rig in run.rigs for name, i in rig.camera_ids.items()}
     for camera_id, shared in enumerate(cameras, 1):
         camera = pycolmap.infer_camera_from_image(run.image_dir / shared.typical, options)
         camera.camera_id = camera_id
         model.add_camera_with_trivial_rig(camera)
         ids |= dict.fromkeys(shared.names, camera_id)
-    for number, name in enumerate(sorted(ids, key=numeric_order), 1):  # successors are neighbours
-        image = pycolmap.Image(name=name, image_id=number, camera_id=ids[name])
+    ordered = sorted(ids, key=numeric_order)  # successors are neighbours
+    images = {
+        name: pycolmap.Image(name=name, image_id=number, camera_id=ids[name])
+        for number, name in enumerate(ordered, 1)
+    }
+    for rig in run.rigs:
+        _add_rig(pycolmap, model, rig, images)
+    for image in images.values():
         model.add_image_with_trivial_frame(image)
     return model
+
+
+def _known_camera(pycolmap: Any, camera_id: int, lens: Intrinsics) -> Any:
+    return pycolmap.Camera(
+        camera_id=camera_id,
+        model=lens.model,
+        width=lens.width,
+        height=lens.height,
+        params=list(lens.params),
+        has_prior_focal_length=True,  # for the verification of matches
+    )
+
+
+def _add_rig(pycolmap: Any, model: Any, rig: PanoramaRig, images: dict[str, Any]) -> None:
+    """Add the cameras and frames of panoramas of one size to a model, and their images.
+
+    The images are taken out of ``images``. A frame has the id of its first image.
+    """
+    record = pycolmap.Rig(rig_id=rig.first_id)
+    for camera_id, turn in enumerate(FACES.values(), rig.first_id):
+        camera = _known_camera(pycolmap, camera_id, rig.lens)
+        model.add_camera(camera)
+        if camera_id == rig.first_id:  # the face in front, in the panorama's axes
+            record.add_ref_sensor(camera.sensor_id)
+        else:
+            pose = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), np.zeros(3))
+            record.add_sensor(camera.sensor_id, pose)
+    model.add_rig(record)
+    for names in rig.faces:
+        faces = [images.pop(name) for name in names]
+        frame = pycolmap.Frame(frame_id=faces[0].image_id, rig_id=rig.first_id)
+        for image in faces:
+            frame.add_data_id(image.data_id)
+        model.add_frame(frame)
+        for image in faces:
+            image.frame_id = frame.frame_id
+            model.add_image(image)
 
 
 def posed_model(pycolmap: Any, poses: Sequence[Image], without: Collection[str] = ()) -> Any:
@@ -177,15 +224,7 @@ def posed_model(pycolmap: Any, poses: Sequence[Image], without: Collection[str] 
         lens = posed.intrinsics
         camera_id = ids.setdefault(lens.camera_id, len(ids) + 1)
         if not model.exists_camera(camera_id):
-            camera = pycolmap.Camera(
-                camera_id=camera_id,
-                model=lens.model,
-                width=lens.width,
-                height=lens.height,
-                params=list(lens.params),
-                has_prior_focal_length=True,  # for the verification of matches
-            )
-            model.add_camera_with_trivial_rig(camera)
+            model.add_camera_with_trivial_rig(_known_camera(pycolmap, camera_id, lens))
         if posed.name in without:
             continue
         image = pycolmap.Image(name=posed.name, image_id=number, camera_id=camera_id)
@@ -201,9 +240,12 @@ def rigid(pycolmap: Any, image: Image) -> Any:
 
 def mapping_options(run: ColmapRun) -> Any:
     """Return COLMAP's options of mapping and triangulation, for this run."""
-    return run.pycolmap.IncrementalPipelineOptions(
+    options = run.pycolmap.IncrementalPipelineOptions(
         num_threads=run.settings.threads, random_seed=run.settings.seed
     )
+    options.constant_rigs = {rig.first_id for rig in run.rigs}
+    options.constant_cameras = {rig.first_id + k for rig in run.rigs for k in range(len(FACES))}
+    return options
 
 
 def triangulate_points(

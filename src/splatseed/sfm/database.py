@@ -5,8 +5,9 @@ that a kill leaves one or the other. Features are copied where the photograph is
 where both are; the geometry of pairs is verified again, which depends on cameras, too.
 
 Images and cameras are written before features are detected, so that ids are ours: camera i has rig
-i, image i has frame i, counted from 1. Python's sqlite3 is another copy of SQLite, and two copies
-in one process release each other's file locks, which corrupts the file: only pycolmap opens it.
+i, image i has frame i, counted from 1; a rig of panoramas has the id of its first camera, a frame
+of theirs that of its first image. Python's sqlite3 is another copy of SQLite, and two copies in one
+process release each other's file locks, which corrupts the file: only pycolmap opens it.
 """
 
 from __future__ import annotations
@@ -59,11 +60,13 @@ def numbered(database: Any) -> Iterator[None]:
 
 
 def _write_model(database: Any, model: Any) -> None:
-    for camera_id, camera in sorted(model.cameras.items()):
+    for _, camera in sorted(model.cameras.items()):
         database.write_camera(camera, use_camera_id=True)
-        database.write_rig(model.rig(camera_id), use_rig_id=True)
+    for rig_id in sorted(model.rigs):
+        database.write_rig(model.rig(rig_id), use_rig_id=True)
+    for frame_id in sorted(model.frames):
+        database.write_frame(model.frame(frame_id), use_frame_id=True)
     for image_id in sorted(model.images):
-        database.write_frame(model.frame(image_id), use_frame_id=True)
         database.write_image(model.image(image_id), use_image_id=True)
 
 

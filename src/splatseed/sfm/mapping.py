@@ -197,8 +197,8 @@ def _relinked(
         with closing(connect(run.database)) as source, closing(connect(alone.database)) as copy:
             source.backup(copy)
         model = run.pycolmap.Reconstruction(given)
-        for name in found.part:
-            model.deregister_frame(model.find_image_with_name(name).frame_id)
+        for frame_id in {model.find_image_with_name(name).frame_id for name in found.part}:
+            model.deregister_frame(frame_id)
         (rest := folder / "rest").mkdir()
         model.write(rest)
         with run.pycolmap.Database.open(alone.database) as database:
@@ -244,7 +244,11 @@ def _map_at_once(run: ColmapRun, folder: Path, total: int) -> tuple[Path, Any] |
     options = pycolmap.GlobalPipelineOptions(
         num_threads=settings.threads, random_seed=settings.seed
     )
-    options.mapper.bundle_adjustment.refine_focal_length = not run.holds_focal
+    adjustment = options.mapper.bundle_adjustment
+    adjustment.refine_focal_length = not (run.holds_focal or run.rigs)
+    if run.rigs:  # it can hold no camera alone: what is mapped after it refines the others
+        adjustment.refine_extra_params = adjustment.refine_sensor_from_rig = False
+        options.mapper.refine_sensor_from_rig = False
     try:
         models = run.stage(
             "global mapping",

@@ -58,6 +58,8 @@ def match_photographs(
         started = time.perf_counter()
         features = largest_features(database, ids)
         agreement = measure_agreement(features, run.on_progress)
+        frames = [model.image(image_id).frame_id for image_id in ids]
+        agreement = agreement * np.not_equal.outer(frames, frames)
         run.seconds[STAGE] = time.perf_counter() - started
         if poses:
             expected = _expected_agreement(run, database, model, poses)
@@ -183,6 +185,8 @@ def match_pairs(
     has a ``stage`` of its own.
     """
     pycolmap, settings = run.pycolmap, run.settings
+    frames = {image.image_id: image.frame_id for image in database.read_all_images()}
+    pairs = [(a, b) for a, b in pairs if frames[a] != frames[b]]  # no parallax within a panorama
     listed = run.work / "pairs.txt"
     listed.write_text("".join(f"{a} {b}\n" for a, b in pairs), "ascii")
     matched = sum(database.exists_matches(*pair) for pair in pairs)

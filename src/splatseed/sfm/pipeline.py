@@ -22,7 +22,7 @@ from splatseed import errors
 from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.findings import Finding
 from splatseed.io import write_scene
-from splatseed.io.colmap_layout import write_split
+from splatseed.io.colmap_layout import write_lists, write_split
 from splatseed.io.colmap_model import read_model_cameras
 from splatseed.io.depth_maps import write_lenses
 from splatseed.io.files import StrPath
@@ -55,9 +55,21 @@ from splatseed.sfm.colmap import ColmapRun, Settings
 from splatseed.sfm.export import drop_repeats, export_scene
 from splatseed.sfm.mapping import map_images
 from splatseed.sfm.matching import match_further, match_photographs
+from splatseed.sfm.panoramas import (
+    PanoramaRig,
+    PanoramasName,
+    check_mask_below,
+    cut_finding,
+    cut_photographs,
+    cut_scene,
+    find_panoramas,
+    rigs_of,
+    split_of_faces,
+)
 from splatseed.sfm.photos import find_photos, match_poses
 from splatseed.sfm.refinement import Refinement, refine, unrefined_finding
 from splatseed.sfm.work_folder import WorkFolder, resumable_work, work_key
+from splatseed.text import counted
 
 OnPhotos: TypeAlias = Callable[[Sequence[str], Mapping[str, Sequence[str]], str], None]
 _DEFAULT = Settings()
@@ -95,6 +107,8 @@ def reconstruct(
     *,
     camera_model: str | None = None,
     shared_camera: bool = True,
+    panoramas: PanoramasName = "auto",
+    mask_below: float = 0.0,
     poses_from: Scene | None = None,
     refine_poses: bool = False,
     test_names: Collection[str] = (),
@@ -124,6 +138,9 @@ def reconstruct(
             one (``sfm.cameras``), as they would fit distortion to noise.
         shared_camera: One camera per lens (``share_cameras``), or one per photograph, if poses are
             not known.
+        panoramas: Which photographs are equirectangular panoramas, if poses are not known: those
+            recognised, ``all`` or ``none``. Each is cut into six photographs, which get one pose.
+        mask_below: Angle of straight down, in degrees, within which panoramas are masked.
         poses_from: A scene with poses and intrinsics; its points are ignored.
         refine_poses: Refine poses that are off by a few degrees or per cent of the cameras' extent
             (phones, SLAM). They are unchanged if refinement would lower the mean reprojection
@@ -155,16 +172,33 @@ def reconstruct(
     images = Path(image_dir).absolute()
     photos, left_out = find_photos(images)
     poses = None if poses_from is None else match_poses(photos, poses_from, images)
-    cameras = share_cameras(photos)
-    described = describe_cameras(cameras) if poses is None and shared_camera else ""
+    whole, found = find_panoramas(images, photos, panoramas if poses is None else "none")
+    check_mask_below(mask_below, whole)
+    others = {name: photo for name, photo in photos.items() if name not in whole}
+    cameras = share_cameras(others)
+    described = describe_cameras(cameras) if cameras and poses is None and shared_camera else ""
     if not shared_camera:
-        cameras = tuple(SharedCamera((name,), name, "") for name in photos)
+        cameras = tuple(SharedCamera((name,), name, "") for name in others)
     with _staged(images, Path(output), "sfm", overwrite=overwrite) as staging:
+        faces: dict[str, list[str]] = {}
+        for finding in found:
+            note(finding)
+        if whole:
+            images, faces, masks = cut_photographs(
+                *(images, whole, others, staging / _WORK / "cut"),
+                masks=masks,
+                mask_below=mask_below,
+                white=find_white([images / name for name in whole])[0],
+                progress=on_progress,
+            )
+            photos, _ = find_photos(images)
+        rigs = rigs_of(whole, faces, len(cameras) + 1)
         if on_photos is not None:
             on_photos(list(photos), left_out, described)
         if refine_poses or poses is None:
             settings = _for_poses(settings, photos)
-        lenses = _lenses(cameras, camera_model or default_model(len(photos)), poses)
+        lenses = _lenses(cameras, camera_model or default_model(len(others)), poses)
+        lenses += [([*rig.camera_ids], rig.lens) for rig in rigs]
         white, _ = find_white([images / name for name in photos])
         key = work_key(
             *(photos, lenses, masks, settings.seed),
@@ -176,7 +210,12 @@ def reconstruct(
         work = resumable_work(Path(output), key, note, resume=resume)
         with work if keep or resume else nullcontext() as kept:
             how = (images, staging, settings, on_progress, kept, _reconstruct)
-            report: SfmReport = _call(*how, list(photos), cameras, *options)
+            report: SfmReport = _call(*how, list(photos), cameras, rigs, *options)
+        posed = photos.keys() - {*report.unregistered}
+        names = {name: faces.get(name, [name]) for name in (*others, *whole)}
+        split = split_of_faces({n: [f for f in each if f in posed] for n, each in names.items()})
+        if whole and split is not None and split.train and split.test:
+            write_lists(staging, sorted(split.train), sorted(split.test))
         if poses_from is not None:
             write_split(poses_from, staging)
             write_offset(staging, poses_from.offset)
@@ -208,6 +247,7 @@ def _reconstruct(
     staging: Path,
     names: Sequence[str],
     cameras: Sequence[SharedCamera],
+    rigs: Sequence[PanoramaRig],
     camera_model: str | None,
     poses: Sequence[Image] | None,
     refine_poses: bool,
@@ -219,9 +259,10 @@ def _reconstruct(
     finding: Finding | None = None
     held: Finding | None = None
     if poses is None:
-        count, chosen = len(names), camera_model or default_model(len(names))
+        count = sum(len(camera.names) for camera in cameras)
+        chosen, run = camera_model or default_model(count), replace(run, rigs=rigs)
         model = colmap.guessed_model(run, cameras, chosen)
-        if camera_model is None and count < MIN_DISTORTION:
+        if camera_model is None and 0 < count < MIN_DISTORTION:
             known = all(camera.has_prior_focal_length for camera in model.cameras.values())
             run = replace(run, holds_focal=known and count < MIN_FOCAL)
             held = held_lens(count, focal=run.holds_focal)
@@ -262,12 +303,18 @@ def _export(
 
 
 def undistort(
-    scene: Scene, output: StrPath, *, overwrite: bool = False, on_progress: Progress = silent
+    scene: Scene,
+    output: StrPath,
+    *,
+    mask_below: float = 0.0,
+    overwrite: bool = False,
+    on_progress: Progress = silent,
 ) -> SfmReport:
     """Write a scene with undistorted photographs and PINHOLE cameras, in COLMAP's layout.
 
     Poses, points, their origin and tracks stay; 2D features are undistorted. The size of
-    photographs may change slightly.
+    photographs may change slightly. Each panorama (``load_scene(..., panoramas=True)``) becomes six
+    photographs, masked within the angle ``mask_below`` of straight down, in degrees.
 
     Raises:
         SceneNotFoundError: Fewer than half of the photographs exist.
@@ -279,10 +326,14 @@ def undistort(
     require("pycolmap")
     _check_names(scene)
     scene = with_photographs(scene)
-    images = photograph_folder(scene).absolute()
     check_sizes(scene.images)
     scene = scene.replace(images=at_file_size(scene.images), intrinsics=())
-    with _staged(images, Path(output), "undistort", overwrite=overwrite) as staging:
+    given = photograph_folder(scene)
+    whole = {im.name: im.intrinsics for im in scene.images if im.intrinsics.is_panorama}
+    check_mask_below(mask_below, whole)
+    with _staged(given, Path(output), "undistort", overwrite=overwrite) as staging:
+        scene = cut_scene(scene, staging / _WORK / "cut", mask_below, on_progress)
+        images = photograph_folder(scene).absolute()
         work = staging / _WORK / "distorted"
         distorted = write_scene(scene, work, format="colmap", require_points=False).path
         names, how = sorted(image.name for image in scene.images), (images, staging, _DEFAULT)
@@ -293,7 +344,8 @@ def undistort(
         carry_seeds(scene, distorted, staging)
         write_split(scene, staging)
         write_offset(staging, scene.offset)
-    return replace(report, path=Path(output))
+    findings = (cut_finding(counted(len(whole), "panorama"), whole),) if whole else ()
+    return replace(report, path=Path(output), findings=findings)
 
 
 def _undistort(

@@ -92,8 +92,8 @@ def _mask_facts(masks: Masks | None, name: str) -> tuple[object, ...]:
     if masks is None:
         return ()
     path, flags = masks.files.get(name), (masks.inverted, masks.alpha)
-    status = path.stat() if path is not None and path.is_file() else None
-    return (*flags, *((status.st_size, status.st_mtime_ns) if status else ()))
+    # By content: masks of panoramas are cut anew by each run.
+    return (*flags, *([fingerprint(path.read_bytes())] if path and path.is_file() else []))
 
 
 def _digest(facts: Sequence[object]) -> str:
