@@ -169,11 +169,11 @@ class Image:
             self.path, self.white, composited=self.shows_empty_space, background=self.background
         )
 
-    def read_mask(self, factor: int = 1) -> Bool[np.ndarray, "h w"] | None:
+    def read_mask(self, factor: float = 1) -> Bool[np.ndarray, "h w"] | None:
         """Read which pixels of the photograph count; None if all do.
 
         Args:
-            factor: Integer reduction; a reduced pixel counts if its ``factor``^2 block does.
+            factor: Divides width and height; a reduced pixel counts if all of its pixels do.
 
         Raises:
             SceneNotFoundError: The mask's file is missing.
@@ -183,11 +183,11 @@ class Image:
 
         return read_mask(self.masks, self.name, self.path, factor)
 
-    def read_empty(self, factor: int = 1) -> Bool[np.ndarray, "h w"] | None:
+    def read_empty(self, factor: float = 1) -> Bool[np.ndarray, "h w"] | None:
         """Read which pixels show empty space, by their transparency; None if none do.
 
         Args:
-            factor: Integer reduction; a reduced pixel is empty if any of its ``factor``^2 block is.
+            factor: Divides width and height; a reduced pixel is empty if any of its pixels is.
 
         Raises:
             SceneNotFoundError: There is no such file.
@@ -197,11 +197,11 @@ class Image:
 
         return read_empty(self.path, factor) if self.shows_empty_space else None
 
-    def read_opacity(self, factor: int = 1) -> UInt8[np.ndarray, "h w"] | None:
+    def read_opacity(self, factor: float = 1) -> UInt8[np.ndarray, "h w"] | None:
         """Read the alpha of pixels, 255 if opaque; None if none show empty space.
 
         Args:
-            factor: Integer reduction; a reduced pixel has the mean of its ``factor``^2 block.
+            factor: Divides width and height; a reduced pixel has the mean of its pixels.
 
         Raises:
             SceneNotFoundError: There is no such file.
@@ -317,11 +317,11 @@ class Split:
     test: frozenset[str]  # names of the images to test; an image may be in neither
     origin: str  # the list, in words
 
-    @property
-    def sentence(self) -> str:
-        """A note on the split, for messages."""
+    def finding(self, *, given: bool) -> Finding:
+        """Return a note on the split; ``given``: the user passed ``test_every``."""
         count = f"{len(self.train):,} training and {len(self.test):,} test images"
-        return f"The split is that of the scene's {self.origin}: {count}; `test_every` is ignored."
+        text = f"The split is that of the scene's {self.origin}: {count}"
+        return Finding("listed-split", text + ("; `test_every` is ignored." * given or "."), "info")
 
 
 @dataclass(frozen=True)

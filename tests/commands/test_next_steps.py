@@ -12,9 +12,15 @@ import pytest
 
 from splatseed.camera import Intrinsics
 from splatseed.commands import next_steps
-from splatseed.commands.next_steps import print_training, training_commands
+from splatseed.commands.next_steps import (
+    Planned,
+    advice_commands,
+    print_training,
+    training_commands,
+)
 from splatseed.io import load_scene, write_scene
 from splatseed.pointcloud import PointCloud
+from splatseed.seeding.advice import AS_IT_IS, advice_for
 
 
 def lines_of(out: str) -> list[list[str]]:
@@ -68,6 +74,22 @@ def test_what_info_advises_works(points, bent, tmp_path, monkeypatch, splatseed)
     for folder in ("RUN", "SMALL"):
         assert (Path(folder) / "metrics.json").is_file()
     assert points or len(load_scene("OUT").points) > 500
+
+
+def test_minutes_are_those_of_seeds_and_refinement_too(room, monkeypatch):
+    monkeypatch.setattr(next_steps, "which", lambda _: None)  # as without a GPU
+    monkeypatch.setattr(next_steps, "available_cpus", lambda: 1)
+    scene = load_scene(room)
+    planned, advice = Planned.of(scene)._replace(seconds=12.0), advice_for(scene, 1000)
+
+    def label(method, *, refine):
+        advised = dataclasses.replace(advice, method=method)
+        return advice_commands(room, scene, advised, planned, refine=refine)[0][0]
+
+    count = len(scene.images)  # each takes 0.5 s of seeds, and 1.5 s of refinement
+    assert label(AS_IT_IS, refine=False) == "train, about 12 s"
+    assert label("auto", refine=False) == f"train, about {round(12 + 0.5 * count)} s"
+    assert label("auto", refine=True) == f"train, about {round(12 + 2.0 * count)} s"
 
 
 @pytest.mark.parametrize(("trainer", "points"), [("gsplat", True), ("nerfstudio", False)])

@@ -78,6 +78,8 @@ def test_frames_without_a_photograph_or_a_pose_are_left_out(export):
         "2 of 8 frames have no photograph and are left out.",
         "1 photograph without a pose (a .json beside it) is left out, such as frame_00009.jpg.",
     ]
+    severities = {each.severity for each in scene.findings if "have no photograph" in each.text}
+    assert severities == {"info"}
     assert scene.depths.read("frame_00012.jpg").confidence is None
     assert "frame_00015.jpg" not in scene.depths
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 from dataclasses import replace
@@ -35,22 +36,24 @@ def _json(path):
 
 def test_trains_by_the_best_strategy_and_says_what_and_where(room_path, tmp_path, capsys):
     run = tmp_path / "run"
-    words = (room_path, "--max-steps", "3", "--long-side", "48", "--test-every", "8", "-o", run)
+    words = (room_path, "--max-steps", "3", "--long-side", "40", "--test-every", "8", "-o", run)
     assert _run(*words) == 0
     said = capsys.readouterr()
-    size = "rho of 48 x 36 pixels"
-    for words_said in ("-> strategy grow (auto),", f"At most {48 * 36:,} Gaussians: 1{size}"):
+    size = "rho of 40 x 30 pixels"  # 96 x 72, divided by 2.4
+    for words_said in ("-> strategy grow (auto),", f"At most {40 * 30:,} Gaussians: 1{size}"):
         assert words_said in said.err
     for words_said in ("test PSNR", f"splatseed view {run}"):
         assert words_said in said.out
     config, metrics = _json(run / "config.json"), _json(run / "metrics.json")
-    assert (config["strategy"], config["cap_max"]) == ("auto", 48 * 36)
+    assert (config["strategy"], config["cap_max"]) == ("auto", 40 * 30)
     assert config["seeding"] == "advised"
     assert {"psnr", "ssim", "per_image", "train_seconds", "tests"} <= metrics.keys()
     assert metrics["tests"][-1]["psnr"] == pytest.approx(metrics["psnr"], abs=1e-3)
+    assert exit_code("evaluate", run) == 0
+    assert re.search(r"data factor +2\.4\n", capsys.readouterr().out)
     assert _run(*words) == 2
     assert "--overwrite" in capsys.readouterr().err
-    quarter = 48 * 36 // 4
+    quarter = 40 * 30 // 4
     for strategy, budget, cap in (
         ("default", (), None),
         ("none", ("--budget", "0.25rho"), quarter),
@@ -61,7 +64,7 @@ def test_trains_by_the_best_strategy_and_says_what_and_where(room_path, tmp_path
         assert (f"{cap} Gaussians: 0.25{size}" in capsys.readouterr().err) == bool(budget)
     # Where nothing is named, a run goes on as it began.
     asked = TrainSettings()
-    again = replace(asked, max_steps=3, data_factor=2)
+    again = replace(asked, max_steps=3, data_factor=2.4)
     begun = replace(again, strategy="none", seeding="advised", cap_max=quarter)
     assert resumed_settings(config, again, refine_poses=False) == (begun, False)
     with pytest.raises(ParameterError, match="max_steps=3"):

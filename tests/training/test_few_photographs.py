@@ -103,7 +103,9 @@ def test_photographs_are_held_out_where_the_user_or_the_scene_says_so(room, tmp_
         notes = []
         request = TrainRequest.of({**SHORT, **options})
         run = prepare_training(scene, tmp_path / "run", request, note=notes.append)
-        views = [view.name for view in run.trainer.test_views]
+        views, said = [view.name for view in run.trainer.test_views], " ".join(map(str, notes))
+        ignored = scene.listed is not None and "test_every" in options
+        assert ("`test_every` is ignored" in said) == ignored
         return views, "nothing-held-out" in {note.kind for note in notes}
 
     names = sorted(image.name for image in room.images)
@@ -111,4 +113,6 @@ def test_photographs_are_held_out_where_the_user_or_the_scene_says_so(room, tmp_
     assert begun(room, test_every=0, overwrite=True) == ([], False)
     split = Split(frozenset(names[:4]), frozenset(names[4:5]), "list")
     assert begun(room.replace(listed=split), overwrite=True) == ([names[4]], False)
+    listed = room.replace(listed=split)
+    assert begun(listed, test_every=2, overwrite=True) == ([names[4]], False)
     assert begun(room, overwrite=True) == ([], True)

@@ -27,7 +27,7 @@ from splatseed.training import device, prepare, run as run_module, trainer
 from splatseed.training.evaluation import Evaluation
 from splatseed.training.parameters import add_to_mean, gaussians_of, size_unit
 from splatseed.training.prepare import prepare_run
-from splatseed.training.request import PrepareOptions
+from splatseed.training.request import EvaluateRequest, PrepareOptions
 from splatseed.training.settings import TrainSettings
 from splatseed.viewer.models import ViewerItem, viewer_frame
 
@@ -275,8 +275,13 @@ def test_another_split_is_found_out(begin, room, tmp_path):
     resumed.train()
     resumed.finish(evaluate_views)
     found = "The run was trained on 1 of these 2 views: the scene's split was another."
-    for scene, texts in ((room, []), (listed, [listed.listed.sentence, found])):
-        evaluation = Evaluation.of(tmp_path / "run", scene)
+    split = "The split is that of the scene's test.txt: 7 training and 2 test images"
+    for scene, every, texts in (
+        (room, None, []),
+        (listed, None, [f"{split}.", found]),
+        (listed, 3, [f"{split}; `test_every` is ignored.", found]),
+    ):
+        evaluation = Evaluation.of(tmp_path / "run", scene, EvaluateRequest(test_every=every))
         assert [each.text for each in evaluation.findings(evaluation.load())] == texts
     findings = []
     start = TrainSettings(max_steps=2, data_factor=2, start=str(resumed.folder.gaussians))

@@ -220,6 +220,18 @@ def test_two_browsers_have_their_own_switches_and_may_disconnect(viewer, tmp_pat
         assert waits_for(lambda: viewer.sessions not in ([], [one]))
 
 
+def test_requests_that_are_no_page_are_not_logged(viewer, caplog):
+    """Browsers and port scanners make some, which are no fault of the user's."""
+    port = int(viewer.url.rsplit(":", 1)[1])
+    for words in (b"HEAD / HTTP/1.1\r\nHost: x\r\n\r\n", b"no request\r\n\r\n", b""):
+        with socket.create_connection(("127.0.0.1", port)) as probe:
+            probe.sendall(words)
+            probe.shutdown(socket.SHUT_WR)
+            while probe.recv(4096):
+                pass
+    assert [each.getMessage() for each in caplog.records if "websockets" in each.name] == []
+
+
 # What is drawn -----------------------------------------------------------------------------------
 
 
@@ -438,6 +450,14 @@ def test_runs_of_the_same_name_get_unique_names(run_folder, tmp_path):
     assert ([item.name for item in items], second) == (["a/fern/run", "b/fern/run"], 1)
     items, second = verb._open_items(verb.Options(paths[0].parent, compare=paths[0]))
     assert ([item.name for item in items], second) == (["run"], 0)
+
+
+def test_a_web_page_is_for_a_browser(tmp_path, splatseed):
+    page = tmp_path / "a page.HTML"
+    page.write_text("<html>")
+    run = splatseed("view", page)
+    assert run.code == 2
+    assert f"Open it in a browser: {page.as_uri()}" in run.err
 
 
 def test_nothing_to_show_is_an_error(tmp_path):

@@ -285,7 +285,7 @@ class Plan:
     training: TrainSettings = _DEFAULT
     """Training settings; strategy and seed are set per run."""
     long_side: int | None = None
-    """Maximum longer side of the photographs in pixels; determines a data factor per scene."""
+    """Maximum longer side of the photographs in pixels; sets a whole data factor per scene."""
     keep_models: bool = False
     """Whether to keep the trained Gaussians."""
     lpips: bool = False

@@ -7,6 +7,7 @@ depth maps.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,10 +16,10 @@ import numpy as np
 
 from splatseed.depthmap import DepthMaps
 from splatseed.errors import SceneNotFoundError
-from splatseed.findings import Finding
 from splatseed.io import load_originals
 from splatseed.io.clouds import open_cloud
 from splatseed.io.colmap_model import scene_root
+from splatseed.io.downsampling import reduced_size
 from splatseed.io.files import open_file, read_bytes
 from splatseed.io.load import search_depths, with_depths_in
 from splatseed.io.photograph import photograph_bytes
@@ -80,10 +81,9 @@ class SceneFacts(PlannedScene):
     depth_digest: str = ""
     cloud_digest: str = ""
 
-    def pixels_at(self, factor: int) -> int:
-        """The pixels of the first photograph, downsampled by a whole factor."""
-        short_side = self.pixels // self.long_side
-        return (self.long_side // factor) * (short_side // factor)
+    def pixels_at(self, factor: float) -> int:
+        """The pixels of the first photograph, downsampled by a factor."""
+        return math.prod(reduced_size(self.long_side, self.pixels // self.long_side, factor))
 
 
 _DEMO_FACTS = SceneFacts(
@@ -162,7 +162,7 @@ def survey(
     depth = Path(planned.depth or scene.source.root or path)
     if with_depth and (planned.depth or search_depths(scene, depth) is not None):
         maps, scene = str(depth.resolve()), with_depths_in(scene, depth)
-    split = [Finding("listed-split", scene.listed.sentence, "info")] if scene.listed else []
+    split = [scene.listed.finding(given=False)] if scene.listed else []
     for finding in (*scene.findings, *split, *stray_cameras(scene)):
         note(finding)
     return SceneFacts(

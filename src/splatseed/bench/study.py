@@ -101,7 +101,7 @@ class Study:
             factors = {"photographs": factors}
         sized: dict[str, list[str]] = defaultdict(list)
         for name, factor in factors.items():
-            sized[f"1/{factor} of their" if factor != 1 else "full"].append(name)
+            sized[f"1/{factor:g} of their" if factor != 1 else "full"].append(name)
         budget = str(settings["budget"])
         counts = self.runs.groupby(["strategy", "scene", "seeds"]).size()
         low, high = counts.min(), counts.max()
@@ -161,7 +161,7 @@ def studies(runs: Iterable[BenchRun]) -> tuple[Study, ...]:
     grouped = []
     for key, group in groups.items():
         sizes = {(run.spec.scene.digest, run.spec.training.data_factor) for run in group}
-        parts: dict[int, list[BenchRun]] = defaultdict(list)
+        parts: dict[float, list[BenchRun]] = defaultdict(list)
         for run in group:  # by size if a scene has several
             by_size = len(sizes) > len({digest for digest, _ in sizes})
             parts[run.spec.training.factor if by_size else 0].append(run)
@@ -189,7 +189,7 @@ def _study(settings: Mapping[str, object], runs: Sequence[BenchRun]) -> Study:
     for run in runs:
         codes[run.spec.arm.label].add(run.spec.method_version)
     variants: dict[str, Arm] = {}
-    factors: dict[str, int] = {}
+    factors: dict[str, float] = {}
     rows, odd = [], []
     for run in runs:
         spec, result = run.spec, run.result

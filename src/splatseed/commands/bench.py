@@ -111,7 +111,7 @@ class Options:
     """Downsample the photographs by this whole factor; by default, per scene, by the smallest that
     leaves at most 1600 pixels on the longer side."""
     long_side: int | None = None
-    """Maximum longer side of the photographs in pixels; sets --data-factor per scene."""
+    """Maximum longer side of the photographs in pixels; sets a whole --data-factor per scene."""
     depth: tuple[Path, ...] = ()
     """Depth maps for method depth: a folder per scene, or one folder with a subfolder for each; by
     default those of the scene."""

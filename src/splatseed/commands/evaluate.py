@@ -99,7 +99,7 @@ def run(arguments: list[str]) -> None:
     facts = [
         ("Gaussians", f"{result.num_gaussians:,}"),
         ("size", f"{(result.model_bytes or 0) / 1e6:.1f} MB of parameters"),
-        ("data factor", f"{model.data_factor}"),
+        ("data factor", f"{model.data_factor:g}"),
         ("background", name_background(model.scene.background)),
     ]
     written = (("scores", options.output), ("renders", options.renders))

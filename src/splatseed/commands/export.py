@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -44,7 +44,7 @@ if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for i
     from splatseed.training.model_views import ModelViews
 
 PAGE = ".html"
-PAGE_DESCRIPTION = "html: one colour per Gaussian, their mean over the training cameras; browsers"
+PAGE_DESCRIPTION = "html: SuperSplat's viewer with the model as .sog; browsers"
 OWN = "own"
 """The value of --clean for the scene of the run."""
 LOSSLESS = "ply"
@@ -119,7 +119,7 @@ def run(arguments: list[str]) -> None:
         if len(kept) < len(cropped):
             stages["kept"] = kept
         if job.is_page:
-            _write_page(job, kept, clock, findings.append)
+            stages["page"] = _write_page(job, kept, views, clock, findings.append)
         else:
             placed = _write_file(job, kept, clock, findings.append)
             if job.format != LOSSLESS:
@@ -176,8 +176,8 @@ def _checked(options: Options) -> _Job:
         (page and transform is not None, "--transform for a file of Gaussians", "a web page",
          "A page shows the model in its scene's frame: leave it out."),
     )  # fmt: skip
-    if cleans or page:
-        require("torch", *["viser"] * page)
+    if cleans or page:  # a page's harmonics are turned
+        require("torch")
     if named and options.budget is not None:
         require("torch", "gsplat")
     budget = None if options.budget is None else parse_budget(options.budget, 0)
@@ -186,18 +186,25 @@ def _checked(options: Options) -> _Job:
     return _Job(options, path, name, config, scene, crop, transform, budget)
 
 
+def _split(job: _Job) -> dict[str, Any]:
+    """Return the options of the run that choose the views and their size, as far as known."""
+    options = {name: job.config.get(name) for name in ("data_factor", "test_every")}
+    return {name: value for name, value in options.items() if isinstance(value, int | float)}
+
+
 def _views(job: _Job, gaussians: Gaussians, progress: Progress, note: Note) -> ModelViews | None:
     """Find the views of the model's scene, if they are needed and there.
 
     Those of a scene that the user names are an error if they cannot be used.
     """
-    needed = job.budget is not None or not (job.is_page or job.format == LOSSLESS)
+    needed = job.budget is not None or job.format != LOSSLESS
     if job.scene is None or not needed:
         return None
     named = job.options.scene is not None
-    if not named and not all(map(version_of, ("torch", "gsplat"))):
+    if not named and not job.is_page and not _renders():
         return None
-    require("torch", "gsplat")
+    if not job.is_page:
+        require("torch", "gsplat")
     from splatseed.training.model_views import find_model_views
 
     try:
@@ -220,14 +227,9 @@ def _kept(
     if options.clean is not None:
         from splatseed.training.floaters import floaters_of_model
 
-        numbers = {
-            name: value
-            for name in ("data_factor", "test_every")
-            if isinstance(value := job.config.get(name), int)
-        }
         masks = job.config.get("masks")
         bad = floaters_of_model(
-            job.path, Path(str(job.scene)), masks=masks, progress=progress, **numbers
+            job.path, Path(str(job.scene)), masks=masks, progress=progress, **_split(job)
         )
         rows.append(("floaters", f"{np.count_nonzero(bad):,} left out"))
         keep &= ~bad
@@ -290,26 +292,38 @@ def _write_file(job: _Job, kept: Gaussians, progress: Progress, note: Note) -> S
     return moved
 
 
-def _write_page(job: _Job, kept: Gaussians, progress: Progress, note: Note) -> None:
-    """Write the Gaussians as a web page, named after the run or the file."""
-    from splatseed.viewer.models import item_of_model
-    from splatseed.viewer.web_page import check_page_size, write_page
+def _write_page(
+    job: _Job, kept: Gaussians, views: ModelViews | None, progress: Progress, note: Note
+) -> Gaussians:
+    """Write the Gaussians as a web page, named after the run or the file; return what it shows."""
+    from splatseed.viewer.models import ViewerItem
+    from splatseed.viewer.web_page import write_page
 
-    model = job.options.model
-    check_page_size(len(kept))
+    model, world = job.options.model, None if views is None else views.file_from_scene
     name = model.resolve().name if model.is_dir() else model.stem
-    item = item_of_model(name, job.path, kept, note)
-    write_page(job.options.output, item, progress, note)
+    placed = kept if world is None else transform_gaussians(kept, world.inverse)
+    if views is None:
+        item = ViewerItem(name, None, placed, background=background_of(job.path) or BLACK)
+    else:
+        scene = views.scene
+        item = ViewerItem(name, scene, placed, **_split(job), background=scene.background)
+    shown = write_page(job.options.output, item, progress, note)
+    return shown if world is None else transform_gaussians(shown, world)
+
+
+def _renders() -> bool:
+    """Whether the packages that render are there."""
+    return all(map(version_of, ("torch", "gsplat")))
 
 
 def _loss(
     stages: Mapping[str, Gaussians], views: ModelViews | None, *, cropped: bool, progress: Progress
 ) -> RenderLoss | None:
-    """Compare renders of the stages of a model; None for a single one, or without PyTorch.
+    """Compare renders of the stages of a model; None for a single one, or where none are made.
 
     A model without a scene is rendered from cameras around it. Photographs show more than a crop.
     """
-    if len(stages) < 2 or version_of("torch") is None:
+    if len(stages) < 2 or not _renders():
         return None
     from splatseed.splat.render_loss import measure_loss
     from splatseed.splat.training_frame import NO_POINTS, frame_of_model
@@ -323,7 +337,8 @@ def _loss(
         frame = frame_of_model(around, NO_POINTS, models[0])
         return measure_loss(models, around, frame, device, progress)
     test = [replace(view, photograph=NO_PIXELS) if cropped else view for view in views.test]
-    return measure_loss(models, test, views.frame, device, progress, views.background, views.label)
+    background = views.scene.background
+    return measure_loss(models, test, views.frame, device, progress, background, views.label)
 
 
 def _loss_rows(
@@ -348,7 +363,8 @@ def _loss_rows(
 def _loss_findings(
     loss: RenderLoss | None, stages: Mapping[str, Gaussians], job: _Job
 ) -> list[Finding]:
-    found = loss.finding(job.options.output.suffix) if loss and "file" in stages else None
+    packed = {"file", "page"} & stages.keys()
+    found = loss.finding(job.options.output.suffix) if loss and packed else None
     return [found] if found else []
 
 
@@ -366,7 +382,13 @@ def _print_next(job: _Job) -> None:
     options = job.options
     if job.is_page:
         link = visible(options.output.resolve().as_uri())
-        print_next([("open it in a browser, here or wherever you send it", link)])
+        own = {each.name for each in fields(options)} - {"model", "output", "overwrite"}
+        same = any(getattr(options, name) != getattr(Options, name) for name in own)
+        label = f"for SuperSplat's editor{', with the same options' * same}"
+        sog = quoted(options.output.with_suffix(".sog"))
+        packed = f"splatseed export {quoted(options.model)} -o {sog}"
+        opened = "open it in a browser, here or wherever you send it"
+        print_next([(opened, link), (label, packed)])
         return
     rows = [("look at it", f"splatseed view {quoted(options.output)}")]
     split = job.config.get("split")
@@ -383,7 +405,7 @@ def _scoring_command(job: _Job) -> str:
     scene = str(job.scene) if job.scene is not None else scene
     words = ["splatseed evaluate", quoted(options.output)]
     words += ["--scene", quoted(scene) if isinstance(scene, str) else "SCENE"]
-    if not isinstance(factor, int):
+    if not isinstance(factor, int | float):
         text = "Score it at the size of training: N is the --data-factor of the run."
         print_note(Finding("unknown-data-factor", text, "info"))
         words += ["--data-factor", "N"]

@@ -13,10 +13,11 @@ import numpy as np
 from splatseed.console import print_next, print_note
 from splatseed.depth.settings import PER_POINT
 from splatseed.findings import Finding
+from splatseed.io.downsampling import reduced_size
 from splatseed.io.staging import read_manifest
 from splatseed.io.transforms_layout import Layout
 from splatseed.lens import undistort_command, undistorted_folder
-from splatseed.photos.sizes import TRAINED_SIDE, factor_for_size
+from splatseed.photos.sizes import default_factor, factor_for_side, factor_for_size
 from splatseed.progress import available_cpus
 from splatseed.scene import Image, Scene
 from splatseed.seeding.advice import AS_IT_IS, SEEDED, Advice, is_distorted, untrainable
@@ -34,8 +35,8 @@ TrainerName: TypeAlias = Literal[
 RATIO = 16
 SMALL_SIDE, SMALL_STEPS = 480, 1500
 """A run of minutes on a CPU: 146 photographs take 132 seconds on one core (README)."""
-COMPARE_SECONDS = 0.5
-"""CPU seconds in which stereo compares a photograph (benchmarks/README.md, real size)."""
+SEED_SECONDS, REFINE_SECONDS = 0.5, 1.5
+"""CPU seconds per photograph for seeds and refined poses (benchmarks/README.md, real size)."""
 COLMAP_ONLY = frozenset({"gsplat", "graphdeco", "LichtFeld"})
 """Trainers that read COLMAP's layout better than transforms.json."""
 COMMON_LENSES = frozenset({"SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"})
@@ -61,7 +62,7 @@ class Planned(NamedTuple):
     max_seeds: int
     flags: str
     trainer: TrainerName
-    seconds: float  # roughly, of splatseed's own training on this machine's CPU
+    seconds: float  # roughly, of all steps of splatseed's own training on this machine's CPU
     most_seeds: int  # that auto makes without a budget
 
     @classmethod
@@ -71,16 +72,18 @@ class Planned(NamedTuple):
         budget: str | None = None,
         max_steps: int = FULL_RUN,
         trainer: TrainerName = "splatseed",
-        long_side: int = TRAINED_SIDE,
+        long_side: int | None = None,
     ) -> Planned:
         """Plan the training of a scene by the options of ``info``.
 
         The other trainers densify as 3DGS does by default.
         """
         images = scene.images
-        factor = factor_for_size(images, long_side) if images else 1
+        factor: float = default_factor(images)
+        if images and long_side is not None:
+            factor = factor_for_side(images, long_side)
         lenses = [image.lens for image in images]
-        sizes = [(lens.width // factor, lens.height // factor) for lens in lenses]
+        sizes = [reduced_size(lens.width, lens.height, factor) for lens in lenses]
         pixels = round(float(np.median([w * h for w, h in sizes]))) if sizes else BUDGET
         number, flags = max(2, min(BUDGET, pixels)), ""
         if budget is not None:
@@ -98,9 +101,7 @@ class Planned(NamedTuple):
             width, height = sorted(sizes, key=math.prod)[len(sizes) // 2]
             rho = f"{number / pixels:.2g}rho of {width} x {height} pixels"
         seeds = min(len(scene.points), max_seeds) or max_seeds
-        threads = available_cpus()
-        seconds = planned_seconds(settings, seeds, pixels, threads)
-        seconds += COMPARE_SECONDS * len(images) / threads
+        seconds = planned_seconds(settings, seeds, pixels, available_cpus())
         most = len(scene.points) + _most_seeds(images)
         traits = settings.traits
         return cls(number, rho, max_steps, traits, max_seeds, flags, trainer, seconds, most)
@@ -148,11 +149,14 @@ def advice_commands(
     train, label = f"splatseed train {source} {how}-o RUN", "train"
     shorter: Commands = []
     if not (which("nvidia-smi") or which("rocminfo")):
-        label = f"train, about {format_duration(planned.seconds)}"
+        made = advice.method == "auto"
+        first_seconds = _seconds_before(scene, seeds=made, refine=refine and made)
+        label = f"train, about {format_duration(planned.seconds + first_seconds)}"
         small = Planned.of(scene, None, SMALL_STEPS, long_side=SMALL_SIDE)
         how = f"{refining}--long-side {SMALL_SIDE} --max-steps {SMALL_STEPS} -o SMALL"
         command = f"splatseed train {source} {how}"
-        shorter = [(f"or about {format_duration(small.seconds)}", command)]
+        first_seconds = _seconds_before(scene, seeds=made, refine=refine)
+        shorter = [(f"or about {format_duration(small.seconds + first_seconds)}", command)]
     commands = [*first, (label, train), *shorter]
     if advice.method == "auto":
         others = _seeding(path, advice, planned, refine=refine)
@@ -169,6 +173,12 @@ def _seeding(path: Path, advice: Advice, planned: Planned, *, refine: bool) -> s
         how = "--method linear --ratio 1"
     options = [how, "--refine-poses" if refine else "", "-o OUT"]
     return " ".join([f"splatseed upsample {quoted(path)}", *filter(None, options)])
+
+
+def _seconds_before(scene: Scene, *, seeds: bool, refine: bool) -> float:
+    """Estimate the seconds that ``train`` takes on this machine's CPU before its first step."""
+    each = SEED_SECONDS * seeds + REFINE_SECONDS * refine
+    return each * len(scene.images) / available_cpus()
 
 
 def _most_seeds(images: Sequence[Image]) -> int:

@@ -286,7 +286,7 @@ class _TimeLeft:
             text = f"The {steps} take about {format_duration(left)}."
             yield Finding("training-time", text, "info")
         if slow:
-            side = max(view.width, view.height) * settings.factor
+            side = round(max(view.width, view.height) * settings.factor)
             flags = options_for_an_hour(settings, now, side, per_pixel=self._per_pixel)
             text = f"On this CPU, training with {flags} takes about an hour; a GPU is much faster."
             yield Finding("training-time", text, "info")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from splatseed.commands.options import parse_options
+from splatseed.commands.options import parse_options, refuse
 from splatseed.console import (
     add_results,
     print_message,
@@ -34,6 +34,7 @@ if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for i
     from splatseed.viewer.models import ViewerItem
 
 MAX_ITEMS = 12
+PAGE = ".html"
 LOCAL = {"127.0.0.1", "localhost"}
 
 
@@ -66,6 +67,11 @@ def run(arguments: list[str]) -> None:
 
     for path in filter(None, (options.path, options.compare)):
         check_exists(path)  # before the port: a wrong path is the more likely mistake
+        refuse(
+            (path.suffix.lower() == PAGE,
+             f"a scene, a run, a file of points or Gaussians, or a folder of these, not {path}",
+             "a web page", f"Open it in a browser: {visible(path.resolve().as_uri())}"),
+        )  # fmt: skip
     port = free_port(options.host, options.port)
     with stage_display() as clock:
         clock("read", 0.0)

@@ -19,7 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Shaped, UInt8
+from jaxtyping import Bool, UInt8
 from numpy.lib.stride_tricks import sliding_window_view
 from PIL import Image as PilImage
 
@@ -27,6 +27,7 @@ from splatseed.camera import Intrinsics, same_shape
 from splatseed.errors import SceneFormatError, SceneNotFoundError, SplatseedError
 from splatseed.findings import Finding, without_kinds
 from splatseed.io.depth_maps import Undistortion
+from splatseed.io.downsampling import area_means
 from splatseed.io.files import files_below, read_bytes, translate_errors
 from splatseed.io.mask_files import SUFFIXES, find_masks, find_own_masks, masks_among
 from splatseed.io.photograph import (
@@ -55,6 +56,7 @@ _SAMPLE = 5
 _MOST = 0.5
 """Share of masked pixels from which on masks may be inverted ones."""
 _MOSTLY_MASKED, TRANSPARENT = "mostly-masked", "transparent-pixels"  # kinds of findings
+_ROUNDING = 1e-6  # of a mean of valid pixels
 _CUT_OUT, _CHANGING = 0.2, 0.02
 """Share of transparent pixels, in the median photograph, from which on an object may be cut out,
 and of pixels that are transparent in some photographs only: a lens leaves the same border in
@@ -205,11 +207,11 @@ def _resized(files: Mapping[str, Path], folder: Path) -> list[Finding]:
 
 
 def read_mask(
-    masks: Masks | None, name: str, photograph: Path, factor: int = 1
+    masks: Masks | None, name: str, photograph: Path, factor: float = 1
 ) -> Bool[np.ndarray, "h w"] | None:
     """Read which pixels of a photograph are valid; None if all are.
 
-    A pixel reduced by an integer ``factor`` is valid if all ``factor``^2 are.
+    A pixel reduced by ``factor`` is valid if all of its pixels are.
 
     Transparent pixels are not valid where ``Masks.alpha`` says so.
 
@@ -236,7 +238,7 @@ def read_mask(
         return None
     counts = _reduced(np.logical_and.reduce(parts), factor)
     if counts.size and not counts.any():
-        reduced = "" if factor == 1 else f", reduced by a factor of {factor}"
+        reduced = "" if factor == 1 else f", reduced by a factor of {factor:g}"
         raise SceneFormatError(
             f"unmasked pixels of {name} by its mask, {path or photograph}{reduced}",
             found="none",
@@ -246,10 +248,10 @@ def read_mask(
     return None if counts.all() else np.asarray(counts)
 
 
-def read_empty(photograph: Path, factor: int = 1) -> Bool[np.ndarray, "h w"] | None:
+def read_empty(photograph: Path, factor: float = 1) -> Bool[np.ndarray, "h w"] | None:
     """Read the transparent pixels of a photograph; None without any.
 
-    A reduced pixel is transparent if any pixel of its ``factor``^2 block is.
+    A pixel reduced by ``factor`` is transparent if any of its pixels is.
     """
     transparent = read_transparent(photograph)
     if transparent is None or not transparent.any():
@@ -257,24 +259,19 @@ def read_empty(photograph: Path, factor: int = 1) -> Bool[np.ndarray, "h w"] | N
     return ~_reduced(~transparent, factor)
 
 
-def read_opacity(photograph: Path, factor: int = 1) -> UInt8[np.ndarray, "h w"] | None:
+def read_opacity(photograph: Path, factor: float = 1) -> UInt8[np.ndarray, "h w"] | None:
     """Read the alpha of a photograph with transparent pixels; None without any.
 
-    That of a reduced pixel is the mean of its ``factor``^2 block, as its colour over black is.
+    That of a pixel reduced by ``factor`` is the mean of its pixels, as its colour over black is.
     """
     alpha = read_alpha(photograph)
     if alpha is None or (alpha >= OPAQUE).all():
         return None
-    return np.asarray(np.rint(_blocks(alpha, factor).mean(axis=(1, 3))), np.uint8)
+    return np.asarray(np.rint(area_means(alpha, factor)), np.uint8)
 
 
-def _reduced(counts: Bool[np.ndarray, "H W"], factor: int) -> Bool[np.ndarray, "h w"]:
-    return np.asarray(_blocks(counts, factor).all(axis=(1, 3)))
-
-
-def _blocks(pixels: Shaped[np.ndarray, "H W"], factor: int) -> Shaped[np.ndarray, "h f w f"]:
-    rows, columns = pixels.shape[0] // factor, pixels.shape[1] // factor
-    return pixels[: rows * factor, : columns * factor].reshape(rows, factor, columns, factor)
+def _reduced(counts: Bool[np.ndarray, "H W"], factor: float) -> Bool[np.ndarray, "h w"]:
+    return np.asarray(area_means(counts, factor) > 1 - _ROUNDING)
 
 
 def _read_counts(path: Path) -> Bool[np.ndarray, "H W"]:

@@ -96,12 +96,12 @@ def read_phone_scene(
 
 
 def without_photograph(count: int, total: int, noun: str) -> list[Finding]:
-    """Report records of an export that have no photograph, if any."""
+    """Note records of an export that have no photograph, if any: apps keep more poses."""
     if not count:
         return []
     have = agreeing(count, "has no photograph and is", "have no photograph and are")
     text = f"{count} of {counted(total, noun)} {have} left out."
-    return [Finding("missing-photographs", text)]
+    return [Finding("missing-photographs", text, "info")]
 
 
 def _camera(frame: PhoneFrame, camera_id: int) -> Intrinsics:

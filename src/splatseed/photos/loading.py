@@ -21,6 +21,7 @@ from platformdirs import user_cache_path
 
 from splatseed.camera import Camera
 from splatseed.errors import OutputError, ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.io.downsampling import area_means, is_whole, reduced_size, reduction
 from splatseed.io.files import ARCHIVE_FAILURES, StrPath, read_npy, translate_errors
 from splatseed.io.photograph import (
     COPY_AGAIN,
@@ -47,7 +48,7 @@ READERS = 4  # threads that decode photographs
 def load_split(
     scene: Scene,
     *,
-    data_factor: int = 1,
+    data_factor: float = 1,
     test_every: int = 8,
     min_side: int = 1,
     cache_dir: Path | None = None,
@@ -81,7 +82,7 @@ def load_views(
     scene: Scene,
     images: Sequence[Image],
     *,
-    data_factor: int = 1,
+    data_factor: float = 1,
     min_side: int = 1,
     undistort: bool = False,
     draft: bool = False,
@@ -114,9 +115,9 @@ def load_views(
         sizes, factor = check_sizes(images), max(data_factor, 1)
         width, height = sizes[images[0].name]
         check_memory(
-            sum(math.prod(size) for size in sizes.values()) // factor**2, 3,
+            int(sum(math.prod(size) for size in sizes.values()) / factor**2), 3,
             "pixels of photographs",
-            found=f"{len(images)} of {width} x {height}, downsampled by {factor}",
+            found=f"{len(images)} of {width} x {height}, downsampled by {factor:g}",
             fix="Downsample more (`data_factor`), take fewer, or free some memory.",
         )  # fmt: skip
     views = []
@@ -146,7 +147,7 @@ def refuse_distortion(
 
 
 def _load_view(
-    image: Image, data_factor: int, min_side: int, cache_dir: Path | None, *, draft: bool = False
+    image: Image, data_factor: float, min_side: int, cache_dir: Path | None, *, draft: bool = False
 ) -> View:
     photograph = _load_draft(image.path, data_factor) if draft else None
     if photograph is None:
@@ -157,7 +158,7 @@ def _load_view(
     height, width = photograph.shape[:2]
     check_side(image.path, min_side, data_factor, (width, height))
     lens = image.lens
-    K = scaled(lens.K, 1 / data_factor)
+    K = scaled(lens.K, *reduction(lens.width, lens.height, data_factor))
     camera = Camera(K, width, height, image.camera.cam_from_world)
     mask, empty = image.read_mask(data_factor), image.read_empty(data_factor)
     if not lens.has_distortion:
@@ -177,10 +178,10 @@ def _painted(pixels: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
     return np.repeat(np.where(pixels, 255, 0).astype(np.uint8)[..., None], 3, axis=2)
 
 
-def _load_draft(path: Path, factor: int) -> UInt8[np.ndarray, "H W 3"] | None:
+def _load_draft(path: Path, factor: float) -> UInt8[np.ndarray, "H W 3"] | None:
     """Decode a JPEG at about a smaller size, and downsample the rest; None for other files."""
     photograph = open_photograph(path, photograph_bytes(path))
-    width, height = photograph.width // factor, photograph.height // factor
+    width, height = reduced_size(photograph.width, photograph.height, factor)
     if factor < 2 or photograph.format != "JPEG" or photograph.mode not in {"RGB", "L"}:
         return None
     check_side(path, 1, factor, (width, height))
@@ -195,7 +196,7 @@ def _load_draft(path: Path, factor: int) -> UInt8[np.ndarray, "H W 3"] | None:
 
 def load_photograph(
     path: StrPath,
-    factor: int = 1,
+    factor: float = 1,
     cache_dir: Path | None = None,
     white: int = WHITE,
     *,
@@ -221,12 +222,15 @@ def load_photograph(
     if kept is not None and (known := _read(kept)) is not None:
         return known
     original = decode_photograph(path, encoded, white, composited=composited, background=background)
-    width, height = original.width // factor, original.height // factor
+    width, height = reduced_size(original.width, original.height, factor)
     check_side(path, 1, factor, (width, height))
-    photograph = original
-    if factor > 1:
-        photograph = original.reduce(factor, (0, 0, width * factor, height * factor))
-    pixels = np.array(photograph)
+    if not is_whole(factor):
+        pixels = np.array(np.rint(area_means(np.array(original), factor)), np.uint8)
+    elif factor > 1:
+        side = int(factor)
+        pixels = np.array(original.reduce(side, (0, 0, width * side, height * side)))
+    else:
+        pixels = np.array(original)
     if kept is not None:
         with suppress(OutputError, OSError):  # a cache that cannot be written is done without
             kept.parent.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,7 @@
-"""The sizes at which photographs are used: of their files, divided by a whole factor.
+"""The sizes at which photographs are used: of their files, divided by a factor.
 
-A photograph is never enlarged; pixels at the right and lower edge that do not fill a block of
-factor x factor are cut off, so intrinsics are divided by the factor and nothing else changes.
+A photograph is never enlarged. The factor (``io.downsampling``) is whole, so that intrinsics are
+divided by it and nothing else changes, unless training is to use an exact size.
 """
 
 from __future__ import annotations
@@ -54,12 +54,20 @@ def default_factor(images: Sequence[Image]) -> int:
     return factor_for_size(images, TRAINED_SIDE) if images else 1
 
 
-def check_side(name: Path | str, min_side: int, data_factor: int, size: tuple[int, int]) -> None:
+def factor_for_side(images: Sequence[Image], long_side: int) -> float:
+    """The factor, whole or not, that makes the longest side ``long_side`` pixels; at least 1."""
+    side = max(max(image.camera.width, image.camera.height) for image in images)
+    if side <= long_side:
+        return 1
+    return side / long_side if side % long_side else side // long_side
+
+
+def check_side(name: Path | str, min_side: int, data_factor: float, size: tuple[int, int]) -> None:
     """Refuse a downsampled photograph (SceneFormatError) with a side below ``min_side`` pixels."""
     if min(size) < min_side:
         pixels = "pixel" if min_side == 1 else "pixels"
         raise SceneFormatError(
-            f"{name} to have at least {min_side} {pixels} a side, divided by {data_factor}",
+            f"{name} to have at least {min_side} {pixels} a side, divided by {data_factor:g}",
             found=f"{size[0]} x {size[1]}",
             fix="Choose a smaller `data_factor`, or a larger `long_side`.",
         )

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Float64, UInt8
 
 from splatseed.camera import Camera
 from splatseed.errors import ParameterError
+from splatseed.io.downsampling import reduced_size, reduction
 from splatseed.photos.sizes import check_side
 from splatseed.projection import scaled
 from splatseed.scene import Image
@@ -92,7 +93,7 @@ def view_of(camera: Image | Camera | View) -> View:
     return View("", NO_PIXELS, camera)
 
 
-def camera_views(images: Sequence[Image], data_factor: int = 1) -> tuple[View, ...]:
+def camera_views(images: Sequence[Image], data_factor: float = 1) -> tuple[View, ...]:
     """Views of images without pixels, at the size of photographs downsampled by ``data_factor``.
 
     Raises:
@@ -101,8 +102,9 @@ def camera_views(images: Sequence[Image], data_factor: int = 1) -> tuple[View, .
     views = []
     for image in images:
         camera = image.camera
-        width, height = camera.width // data_factor, camera.height // data_factor
+        width, height = reduced_size(camera.width, camera.height, data_factor)
         check_side(image.name, 1, data_factor, (width, height))
-        small = Camera(scaled(camera.K, 1 / data_factor), width, height, camera.cam_from_world)
+        K = scaled(camera.K, *reduction(camera.width, camera.height, data_factor))
+        small = Camera(K, width, height, camera.cam_from_world)
         views.append(View(image.name, NO_PIXELS, small))
     return tuple(views)

@@ -175,7 +175,7 @@ class TrainedModel:
     views: Sequence[View]
     render: Render
     scene: Scene
-    data_factor: int = 1
+    data_factor: float = 1
     findings: tuple[Finding, ...] = ()
 
 
@@ -183,7 +183,7 @@ def load_model(
     model: Gaussians | StrPath,
     scene: Scene | StrPath,
     *,
-    data_factor: int | None = None,
+    data_factor: float | None = None,
     test_every: int = 8,
     transform: str | None = None,
     masks: str | None = None,
@@ -280,7 +280,7 @@ def load_model(
 
 
 def _better_on_white(
-    renderer: Callable[[Color], Render], scene: Scene, views: Sequence[View], data_factor: int
+    renderer: Callable[[Color], Render], scene: Scene, views: Sequence[View], data_factor: float
 ) -> list[Finding]:
     """Report a model without a record of its background whose renders fit better on white."""
     few = ([view for view in views if view.empty is not None] or views)[:_COMPARED]

@@ -24,7 +24,7 @@ from splatseed.io.files import StrPath, read_text
 from splatseed.io.masks import with_masks
 from splatseed.io.staging import reserved
 from splatseed.photos.loading import user_cache_dir
-from splatseed.photos.sizes import factor_for_size
+from splatseed.photos.sizes import factor_for_side
 from splatseed.photos.view import View, camera_views, view_of
 from splatseed.progress import Note, Progress, log_note, silent, silent_note
 from splatseed.requirements import require
@@ -180,7 +180,7 @@ def prepare_training(
     for finding in scene.findings:
         note(finding)
     if scene.listed is not None:
-        note(Finding("listed-split", scene.listed.sentence, "info"))
+        note(scene.listed.finding(given="test_every" in request.named))
     if resumed is None and "test_every" not in request.named:
         settings = _with_default_split(settings, scene, note)
     settings = _sized(settings, scene, request.long_side, resumed, note)
@@ -275,14 +275,14 @@ def _sized(
         if settings.data_factor is None and resumed is not None:
             kept = resumed.read_config().get("data_factor")
             return dataclasses.replace(
-                settings, data_factor=kept if isinstance(kept, int) else None
+                settings, data_factor=kept if isinstance(kept, int | float) else None
             )
         return settings.with_data_factor(scene.images, note)
     if settings.data_factor is not None:
         raise ParameterError("`long_side` or `data_factor`", found="both", fix="Leave one out.")
     if long_side < 1:
         raise ParameterError("`long_side` of 1 or more", found=str(long_side), fix="Try 800.")
-    factor = factor_for_size(scene.images, long_side) if scene.images else 1
+    factor = factor_for_side(scene.images, long_side) if scene.images else 1
     return dataclasses.replace(settings, data_factor=factor)
 
 

@@ -89,12 +89,12 @@ def fit_sizes(
     of the training views.
     """
     seen = [views.train[i] for i in evenly_spaced(len(views.train), MAX_FITTED)]
-    renderer = ModelRenderer(whole, views.frame, device, views.background)
+    renderer = ModelRenderer(whole, views.frame, device, views.scene.background)
     targets = [renderer.image(view) for view in seen]
     best, share, least = kept, 0.0, math.inf
     for i, wider in enumerate(SHARES):
         model = dataclasses.replace(kept, scales=kept.scales + np.float32(math.log1p(wider)))
-        renderer = ModelRenderer(model, views.frame, device, views.background)
+        renderer = ModelRenderer(model, views.frame, device, views.scene.background)
         pairs = zip(seen, targets, strict=True)
         error = sum(float((renderer.image(view) - each).square().sum()) for view, each in pairs)
         progress("fit sizes", (i + 1) / len(SHARES))

@@ -20,6 +20,7 @@ from jaxtyping import Float32
 from splatseed.depth.stereo import stereo_depths
 from splatseed.depth.stereo.maps import StereoResult, StereoSettings
 from splatseed.findings import Finding
+from splatseed.io.downsampling import reduced_size
 from splatseed.io.files import ARCHIVE_FAILURES
 from splatseed.io.staging import atomic_file
 from splatseed.progress import Note, Progress, silent, silent_note
@@ -88,7 +89,7 @@ def stereo_size(
     rendered = settings.max_steps * pixels / len(images) / settings.factor**2
     # The number of pixels is proportional to the square of the size.
     affordable = int(limit * math.sqrt(fraction * cost.pixels * rendered / compared))
-    trained = longest // settings.factor if device == "cpu" else 0
+    trained = reduced_size(longest, longest, settings.factor)[0] if device == "cpu" else 0
     return min(full, max(cost.min_size, trained, affordable))
 
 

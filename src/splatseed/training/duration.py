@@ -22,6 +22,7 @@ GAUSSIANS_PER_SEED = 3.0
 """Gaussians at the end of a run per seed, with densification and without a cap: a guess."""
 HOUR, TOO_LONG = 3600.0, 5400.0
 """Seconds of a suggested run, and seconds above which a shorter run is suggested."""
+_ROUNDING = 1e-6
 MIN_SIDE = 400
 """Longer side, px, down to which smaller photographs are suggested before fewer steps."""
 FEWER_STEPS, STEP_UNIT = 7000, 100
@@ -98,7 +99,8 @@ def options_for_an_hour(
         per_pixel: Whether the budget follows the pixels of the photographs.
     """
     slower = now.seconds / step_seconds(now.device, now.gaussians, now.pixels)
-    factors = range(settings.factor, max(settings.factor, long_side // MIN_SIDE) + 1)
+    smaller_ones = range(math.floor(settings.factor) + 1, long_side // MIN_SIDE + 1)
+    factors = (settings.factor, *smaller_ones)
     fewer = min(FEWER_STEPS, settings.max_steps)
     tried = [(steps, factor) for steps in (settings.max_steps, fewer) for factor in factors]
     for steps, factor in tried:
@@ -114,5 +116,5 @@ def options_for_an_hour(
             break
     else:  # the budget alone takes longer
         steps = max(STEP_UNIT, int(steps * HOUR / needed) // STEP_UNIT * STEP_UNIT)
-    flags = f"`long_side={math.ceil(long_side / factor)}`"
+    flags = f"`long_side={math.ceil(long_side / factor - _ROUNDING)}`"
     return flags if steps == settings.max_steps else f"{flags} `max_steps={steps}`"

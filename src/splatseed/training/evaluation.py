@@ -44,7 +44,7 @@ from splatseed.training.folder import config_of, model_file
 from splatseed.training.request import AS_TRAINED, EvaluateRequest
 from splatseed.training.settings import TrainSettings
 
-LIMITS = {"data_factor": Range(1), "test_every": Range(2, also=0)}
+LIMITS = {"data_factor": (int | float, Range(1)), "test_every": (int, Range(2, also=0))}
 """Of the numbers that a run's config gives where the caller does not."""
 
 
@@ -56,6 +56,7 @@ class Evaluation:
     scene: Path | Scene
     request: EvaluateRequest  # with the values of the run's config, where the caller left some out
     config: Mapping[str, Any] = field(default_factory=dict)  # of the run; empty for other models
+    splits: bool = False  # whether the caller chose the test views
 
     @classmethod
     def of(
@@ -75,14 +76,16 @@ class Evaluation:
         if not isinstance(model, Gaussians):
             config, model = config_of(Path(model)), model_file(Path(model))
         values: dict[str, Any] = {"masks": request.masks or config.get("masks")}
-        for name, limits in LIMITS.items():
+        for name, (kind, limits) in LIMITS.items():
             value = getattr(request, name)
             value = values[name] = config.get(name) if value is None else value
-            if value is not None and not (isinstance(value, int) and limits.contains(value, None)):
+            if value is not None and not (isinstance(value, kind) and limits.contains(value, None)):
                 raise ParameterError(
                     f"`{name}` {limits}", found=str(value), fix="Leave it out for the default."
                 )
-        return cls(model, _scene_of(model, scene, config), replace(request, **values), config)
+        splits = request.test_every is not None
+        request = replace(request, **values)
+        return cls(model, _scene_of(model, scene, config), request, config, splits)
 
     @property
     def test_every(self) -> int:
@@ -128,7 +131,7 @@ class Evaluation:
         """Return what may make the scores wrong, or different from those that the user expects."""
         found, listed = [*loaded.findings], loaded.scene.listed
         if listed is not None:
-            found.append(Finding("listed-split", listed.sentence, "info"))
+            found.append(listed.finding(given=self.splits))
         if self.config:
             found += self._changes(loaded.scene, [view.name for view in loaded.views])
         elif isinstance(self.model, Path):

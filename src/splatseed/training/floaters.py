@@ -61,7 +61,7 @@ def floaters_of_model(
     path: Path,
     scene_path: Path,
     *,
-    data_factor: int | None = None,
+    data_factor: float | None = None,
     test_every: int = 8,
     masks: str | None = None,
     progress: Progress = silent,

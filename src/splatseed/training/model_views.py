@@ -25,12 +25,11 @@ from splatseed.photos.sizes import default_factor
 from splatseed.photos.view import View, camera_views
 from splatseed.progress import Progress, silent
 from splatseed.sampling import evenly_spaced
-from splatseed.scene import BLACK, Color, Image, Scene
+from splatseed.scene import BLACK, Image, Scene
 from splatseed.similarity import Similarity
 from splatseed.splat.background import background_of
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.model_frame import scene_from_model, translate_gaussians, view_in_model_frame
-from splatseed.splat.render_loss import TEST_VIEW
 from splatseed.splat.training_frame import TrainingFrame, frame_of_model
 from splatseed.training.config import has_run_poses
 from splatseed.training.settings import TrainSettings
@@ -50,9 +49,11 @@ class ModelViews(NamedTuple):
     photographs, if the scene has them."""
     frame: TrainingFrame
     """To render in."""
-    background: Color = BLACK
-    """Behind renders, and behind transparent pixels of the photographs."""
-    label: str = TEST_VIEW
+    scene: Scene
+    """Its background is behind renders, and behind transparent pixels of the photographs."""
+    file_from_scene: Similarity | None
+    """From the scene's frame to the file's; None if they are the same."""
+    label: str
     """What the views in ``test`` are."""
 
 
@@ -92,7 +93,8 @@ def find_model_views(
             f"{scene_path} to have images", found="none", fix="Name a scene with its cameras."
         )
     factor = config.get("data_factor")
-    factor = factor if isinstance(factor, int) and factor > 0 else default_factor(scene.images)
+    if not isinstance(factor, int | float) or factor < 1:
+        factor = default_factor(scene.images)
     own = has_run_poses(config, scene)
     world = _file_from_scene(path, gaussians, scene, own=own)
 
@@ -114,8 +116,9 @@ def find_model_views(
         views,
         views_of(compared, pixels=True),
         frame_of_model(views, points if world is None else world.points(points), gaussians),
-        scene.background,
-        TEST_VIEW if test else "training view",
+        scene,
+        world,
+        "test view" if test else "training view",
     )
 
 

@@ -58,8 +58,8 @@ class TrainRequest(PrepareOptions):
     size; by default 1rho for strategy auto and 1000000 for grow and mcmc. If there are more seeds,
     they are thinned."""
     long_side: int | None = None
-    """Instead of --data-factor: downsample by the least whole factor that leaves at most this many
-    pixels on a photograph's longer side."""
+    """Instead of --data-factor: downsample by area, so that the longest side of a photograph has
+    this many pixels."""
     masks: MaskChoice = None
     """A folder of masks, where pixels of 0 do not count, or none; inverted: only they count. By
     default the folder masks beside the photographs. Transparent pixels are empty space around an
@@ -92,7 +92,7 @@ class TrainRequest(PrepareOptions):
 class EvaluateRequest:
     """How to score a model."""
 
-    data_factor: int | None = None
+    data_factor: int | float | None = None
     """Factor by which photographs are downsampled; by default a run's own, else the smallest that
     leaves at most 1600 pixels on the longer side."""
     test_every: int | None = None

@@ -59,9 +59,9 @@ class TrainSettings:
     at all; -3dgs: 3DGS's own rates, sizes and schedules, to compare with published numbers."""
     max_steps: Annotated[int, Range(1)] = FULL_RUN
     """Training steps; schedules and learning rates adapt to them."""
-    data_factor: Annotated[int | None, Range(1)] = None
-    """Divide the width and height of the photographs by this whole number; by default by the
-    smallest that leaves at most 1600 pixels on their longer side."""
+    data_factor: Annotated[int | float | None, Range(1)] = None
+    """Divide the width and height of the photographs by this number; by default by the smallest
+    whole one that leaves at most 1600 pixels on their longer side."""
     seed: Annotated[int, Range(0)] = 0
     """Random seed; on the CPU, runs repeat exactly."""
     # The option is --budget.
@@ -125,7 +125,7 @@ class TrainSettings:
         return replace(self, data_factor=factor)
 
     @property
-    def factor(self) -> int:
+    def factor(self) -> float:
         """The data factor; 1 before ``with_data_factor``."""
         return self.data_factor or 1
 

@@ -94,7 +94,7 @@ def orbit(
     """
     if len(views) > 1:
         centers = _poses(views)[:, :3]
-        focus, lens = _orbited(views, gaussians), _lens(views, size)
+        focus, lens = orbit_center(views, gaussians), _lens(views, size)
     else:
         focus = np.median(gaussians.means.astype(np.float64), axis=0)
         reach = np.quantile(np.linalg.norm(gaussians.means - focus, axis=1), CORE)
@@ -125,7 +125,7 @@ def orbit(
     return _posed(lens, [(eye, focus, up) for eye in eyes])
 
 
-def _orbited(views: Sequence[View], gaussians: Gaussians) -> Float64[np.ndarray, " 3"]:
+def orbit_center(views: Sequence[View], gaussians: Gaussians) -> Float64[np.ndarray, " 3"]:
     """Focus of the cameras; if these look one way and it is not in the scene, a point ahead."""
     focus, (centers, axes, _) = focus_point(views), np.split(_poses(views), 3, axis=1)
     forward = axes.mean(axis=0)

@@ -24,7 +24,7 @@ from splatseed.io.files import StrPath
 from splatseed.photos.camera_check import reference_points
 from splatseed.photos.upright import quarter_turns, turned
 from splatseed.photos.view import View, camera_views, view_of
-from splatseed.progress import Note, silent_note
+from splatseed.progress import Note
 from splatseed.scene import BLACK, TEST_EVERY, Color, Scene
 from splatseed.similarity import Similarity
 from splatseed.splat.background import background_of
@@ -60,7 +60,7 @@ class ViewerItem:
     name: str
     scene: Scene | None = None
     gaussians: Gaussians | None = None
-    data_factor: int = 1
+    data_factor: float = 1
     test_every: int = TEST_EVERY
     findings: tuple[Finding, ...] = ()
     moved: Similarity | None = None
@@ -126,10 +126,11 @@ def open_item(path: StrPath, scene_path: Path | None = None) -> ViewerItem:
             fix=f"Continue it: splatseed train SCENE -o {quoted(folder.path)} --resume.",
         )
     scene = scene_at(scene_path) or scene_of_run(folder)
-    factor, every = _split_of_run(folder)
+    config = folder.read_config()
+    factor, every = config.get("data_factor") or 1, int(config.get("test_every", TEST_EVERY))
     gaussians, moved = read_gaussians(folder.gaussians, findings.append), None
     if scene is not None:
-        own = has_run_poses(folder.read_config(), scene)
+        own = has_run_poses(config, scene)
         gaussians, moved = _in_scene(folder.gaussians, scene, gaussians, findings.append, own=own)
     return ViewerItem(folder.path.name, scene, gaussians, factor, every, tuple(findings), moved)
 
@@ -168,28 +169,6 @@ def scene_of_run(folder: RunFolder) -> Scene | None:
         with suppress(SceneNotFoundError, SceneFormatError):  # it was moved or deleted
             return without_dropped(load_scene(Path(own), require_points=False), config)
     return None
-
-
-def item_of_model(
-    name: str, model: Path, gaussians: Gaussians, note: Note = silent_note
-) -> ViewerItem:
-    """Return Gaussians read from a model file, with the scene of the run that the file is of.
-
-    ``gaussians`` may be a part of the file's; they are moved to the scene's world.
-    """
-    folder = RunFolder(model.parent)
-    if model != folder.gaussians or not folder.is_run:
-        return ViewerItem(name, None, gaussians)
-    scene = scene_of_run(folder)
-    if scene is not None:
-        own = has_run_poses(folder.read_config(), scene)
-        gaussians, _ = _in_scene(model, scene, gaussians, note, own=own)
-    return ViewerItem(name, scene, gaussians, *_split_of_run(folder))
-
-
-def _split_of_run(folder: RunFolder) -> tuple[int, int]:
-    config = folder.read_config()
-    return int(config.get("data_factor") or 1), int(config.get("test_every", TEST_EVERY))
 
 
 def unique_names(paths: Sequence[Path]) -> list[str]:

@@ -9,6 +9,7 @@ count as training.
 from __future__ import annotations
 
 import io
+import logging
 import queue
 import signal
 import socket
@@ -83,6 +84,8 @@ class Viewer:
         self._lock = threading.Lock()
         # A browser may disconnect at any moment, which needs no warning.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
+        # Nor does a request that is no page's: websockets logs each with a traceback.
+        logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
         with redirect_stdout(io.StringIO()):  # viser prints its own address
             self.server: Any = viser.ViserServer(host, port, label="splatseed", verbose=False)
         self.server.gui.configure_theme(

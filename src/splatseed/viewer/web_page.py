@@ -1,72 +1,103 @@
-"""A model as one web page: viser's viewer, with the Gaussians inside a single .html file.
+"""A model as one web page: PlayCanvas's SuperSplat viewer, with the model inside as an ``.sog``.
 
-Promise: the page needs no network and no server; a browser opens it from disk. It has what viser's
-splats can hold: positions, covariances in half precision, and per Gaussian one opacity and one
-colour of 8 bits each. Colours that depend on the view become their mean over the training cameras.
+Promise: the page needs no network and no server; a browser opens it from disk. It draws what the
+``.sog`` keeps: sizes, opacities and colours that depend on the view, as sharp as training saw them
+(``_as_trained``). The folder ``supersplat`` has the stylesheet and the bundle of
+@playcanvas/supersplat-viewer 1.36.2 as published, compressed by ``gzip -9n``, and its licence.
+Source of its options and settings: its API reference.
+
+Notation: the page's frame is the viewer frame, turned so that up is -y: the viewer turns a file's
+axes by half a turn about z, and takes y for up.
 """
 
 from __future__ import annotations
 
+import gzip
 import html
-import io
-from contextlib import redirect_stdout
+import json
+import math
+import tempfile
+from base64 import b64encode
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from string import Template
 
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
-from scipy.spatial.transform import Rotation
+from jaxtyping import Float64
 
+from splatseed.camera import Camera
 from splatseed.errors import OutputError
-from splatseed.findings import Finding
 from splatseed.io.staging import atomic_file
-from splatseed.photos.upright import up_direction
+from splatseed.photos.upright import vertical
 from splatseed.photos.view import View
+from splatseed.photos.viewpoint import choose_image
 from splatseed.photos.visibility import points_in_image
 from splatseed.progress import Note, Progress, silent, silent_note
-from splatseed.rendering.harmonics import sh_basis
-from splatseed.requirements import require
 from splatseed.sampling import evenly_spaced
-from splatseed.splat.gaussians import SH_C0, Gaussians, antialiasing_finding
-from splatseed.splat.packing import opacity_bytes, unit_quats
-from splatseed.text import counted
-from splatseed.viewer.flights import orbit
+from splatseed.similarity import Similarity
+from splatseed.splat.formats import read_gaussians, write_gaussians
+from splatseed.splat.gaussians import Gaussians
+from splatseed.splat.model_frame import transform_gaussians
+from splatseed.viewer.flights import DEFAULT_SIZE, orbit, orbit_center
 from splatseed.viewer.models import ViewerItem, viewer_frame
-from splatseed.viewer.page import GROUND
-from splatseed.viewer.server import place_camera
 
 MAX_GAUSSIANS = 4_000_000
-"""Most Gaussians in a page. Browsers load it as one text, of at most half a gigabyte in Chrome, and
-unpack it to several times that."""
-PAGE_BYTES = 35
+"""Most Gaussians in a page: browsers unpack a model to several times its size."""
+PAGE_BYTES = 40
 """Bytes of a page per Gaussian, about."""
-COLOR_VIEWS = 24
-"""Training cameras, evenly chosen, over which colours are averaged: with 100, PSNR is within 0.1 dB
-on three captures."""
-MAX_SIZE = 250.0
-"""Largest standard deviation in the page's unit: half precision holds squares up to 65,504."""
-MIN_SIZE = 0.03
-"""Smallest for which half precision holds a covariance to 0.1%, except for very flat ones."""
-SMALL_SHARE = 0.05
-"""Share of the Gaussians that may be smaller than that, to keep the largest as they are."""
-TINY = float(np.finfo(np.float32).tiny)
-_WORKER = """<script>
-// Chrome does not start module workers from blobs in a page from disk: the worker that sorts the
-// Gaussians by depth is started as a classic one.
-if (location.protocol === "file:") {
-  const Module = Worker;
-  window.Worker = class extends Module {
-    constructor(url, options) {
-      const request = new XMLHttpRequest();
-      request.open("GET", url, false);
-      request.send();
-      const code = request.responseText.replaceAll("import.meta.url", "self.location.href");
-      const blob = new Blob([code], { type: "text/javascript" });
-      super(URL.createObjectURL(blob), { ...options, type: "classic" });
-    }
-  };
+ASPECT = 1.5
+"""Of the window that shows the whole first image."""
+MAX_FOV = 120.0
+"""Of the viewer's cameras, degrees."""
+BLUR = 0.3
+"""Variance that rendering adds to each Gaussian, pixels squared."""
+KERNEL = 1.076
+"""Area under a Gaussian, cut off where alpha is 1/255, over that under the viewer's kernel, which
+subtracts exp(-4) so as to vanish at sqrt(8) sigma; of an opaque Gaussian."""
+BLUR_VIEWS = 24
+"""Training cameras, evenly chosen, whose pixels give the blur of training."""
+_HALF_TURN = np.diag([-1.0, -1.0, 1.0])
+_PAGE = Template("""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>$name</title>
+<!-- SuperSplat viewer: $licence -->
+<style>$style
+html, body { height: 100%; margin: 0; overflow: hidden; background: rgb($background); }</style>
+</head>
+<body>
+<script type="text/plain" id="code">$viewer</script>
+<script type="text/plain" id="model">$model</script>
+<script type="module">
+const bytes = (id) =>
+  Uint8Array.from(atob(document.getElementById(id).textContent), (c) => c.charCodeAt(0));
+const fail = (error) => {
+  document.body.textContent = `This browser cannot show the model: $${error}`;
+};
+window.show = (createViewer) => {
+  const contents = Promise.resolve(new Response(bytes("model")));
+  createViewer({ container: document.body, contents, ...$options }).then((viewer) => {
+    viewer.events.on("loaded:changed", () => (viewer.state.cameraMode = "orbit"));
+    window.viewer = viewer;
+  }).catch(fail);
+};
+try {
+  const code = new Blob([bytes("code")]).stream().pipeThrough(new DecompressionStream("gzip"));
+  const script = document.createElement("script");
+  script.type = "module";
+  script.textContent = (await new Response(code).text()) + "\\nwindow.show(createViewer);";
+  document.head.append(script);
+} catch (error) {
+  fail(error);
 }
-</script>"""
+</script>
+</body>
+</html>
+""")
 
 
 def check_page_size(gaussians: int) -> None:
@@ -83,92 +114,100 @@ def check_page_size(gaussians: int) -> None:
 
 def write_page(
     path: Path, item: ViewerItem, progress: Progress = silent, note: Note = silent_note
-) -> None:
-    """Write a model as a web page that starts at its first training camera.
+) -> Gaussians:
+    """Write a model as a web page that starts at the training camera that sees most.
 
     Without a scene it starts outside of the model.
-    """
-    require("viser")
-    import viser  # noqa: PLC0415  (of the extra view)
 
-    model = item.model
+    Returns:
+        The Gaussians as the page has them, for renders with the blur of training, in the item's
+        world.
+    """
+    model, start, center = item.model, *_start(item)
     check_page_size(len(model))
-    progress("encode", 0.0)
-    if model.antialiased:
-        note(antialiasing_finding("a web page"))
-    frame = viewer_frame(item)
-    covariances, unit, clipped = page_covariances(model, frame.scale)
-    if clipped:
-        text = f"The page draws {counted(clipped, 'huge Gaussian')} smaller: it cannot hold them."
-        note(Finding("clipped-sizes", text))
-    colors = mean_colors(model, item.central_views)
-    means = (model.means.astype(np.float64) - frame.origin) * frame.scale
-    progress("encode", 0.5)
-    with redirect_stdout(io.StringIO()):  # viser prints an address
-        server: Any = viser.ViserServer("127.0.0.1", 0, verbose=False)
-    try:
-        ground = np.full((1, 1, 3), GROUND, np.uint8)
-        server.scene.set_background_image(ground, format="png")
-        server.scene.add_gaussian_splats(
-            "/gaussians",
-            (unit * means).astype(np.float32),
-            covariances,
-            colors,
-            opacity_bytes(model.opacities)[:, None],
-            scale=1 / unit,
-        )
-        views = item.central_views
-        start = views[0] if views else orbit([], model, 1, (600, 400))[0]
-        place_camera(server, start.camera, up_direction([view.camera for view in views]), frame)
-        farthest = np.linalg.norm(means, axis=1).max() + MAX_SIZE / unit
-        server.initial_camera.far = float(max(server.initial_camera.far, 2 * farthest))
-        text = server.get_scene_serializer().as_html()
-    finally:
-        with redirect_stdout(io.StringIO()):
-            server.stop()
-    text = text.replace("<title>Viser</title>", f"<title>{html.escape(item.name)}</title>", 1)
-    text = text.replace("<script", f"{_WORKER}<script", 1)
-    progress("encode", 1.0)
+    placed = _page_from_world(item, start)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "model.sog"
+        shown = _as_trained(model, item.train_views)
+        write_gaussians(file, transform_gaussians(shown, placed), progress, note)
+        packed, held = file.read_bytes(), read_gaussians(file)
+    ahead = start.world_from_cam[:3, 2]
+    distance = max(float((center - start.center) @ ahead), 1e-2 / placed.scale)
+    places = placed.points(np.stack([start.center, start.center + distance * ahead])) @ _HALF_TURN
+    camera = {"position": places[0].tolist(), "target": places[1].tolist(), "fov": _fov(start)}
+    color = [value / 255 for value in item.background]
+    options = {
+        # Version 1, which the viewer reads with all effects off.
+        "settings": {"background": {"color": color}, "camera": camera},
+        "contentUrl": "model.sog",
+        "contentFilename": "model.sog",
+        "noanim": True,
+        "renderer": "webgpu",  # or WebGL, where a browser has none
+        "aa": model.antialiased,
+        "exposeGlobals": True,
+    }
+    supersplat = files("splatseed.viewer") / "supersplat"
+    text = _PAGE.substitute(
+        name=html.escape(item.name),
+        licence=(supersplat / "LICENSE").read_text("utf-8"),
+        style=gzip.decompress((supersplat / "index.css.gz").read_bytes()).decode(),
+        background=", ".join(map(str, item.background)),
+        viewer=b64encode((supersplat / "index.js.gz").read_bytes()).decode(),
+        model=b64encode(packed).decode(),
+        options=json.dumps(options),
+    )
     with atomic_file(path) as partial:
         partial.write_text(text, "utf-8")
+    return _as_trained(transform_gaussians(held, placed.inverse), item.train_views, undo=True)
 
 
-def page_covariances(
-    model: Gaussians, scale: float
-) -> tuple[Float32[np.ndarray, "N 3 3"], float, int]:
-    """Return covariances for half precision, their unit per viewer frame unit, and a count.
+def _as_trained(model: Gaussians, views: Sequence[View], *, undo: bool = False) -> Gaussians:
+    """Enlarge Gaussians so that the viewer shows them as training did, or undo that.
 
-    The unit makes the largest fit, unless that would round many small ones off; then the count of
-    Gaussians that are clipped is not 0.
+    Rendering blurs by ``BLUR`` in pixels of the photographs; the viewer by less, in pixels of the
+    window: thin Gaussians become spikes between which one sees the background. So the blur becomes
+    part of their size, that of the training cameras that have them in their image: the mean over
+    these, by the inverse square of the distance. The viewer's narrower kernel is made up for.
     """
-    sizes = np.exp(model.scales.astype(np.float64)) * scale
-    largest = sizes.max(axis=1)
-    small, huge = (max(float(np.quantile(largest, q)), TINY) for q in (SMALL_SHARE, 1.0))
-    unit = max(MAX_SIZE / huge, MIN_SIZE / small)
-    clipped = int(np.count_nonzero(largest * unit > MAX_SIZE * (1 + 1e-9)))
-    # Rotation times the size along each of its axes: RS, and RS (RS)' is the covariance.
-    rotated = Rotation.from_quat(unit_quats(model.quats)[:, [1, 2, 3, 0]]).as_matrix()
-    rotated = rotated * np.minimum(sizes * unit, MAX_SIZE)[:, None, :]
-    return (rotated @ rotated.transpose(0, 2, 1)).astype(np.float32), unit, clipped
-
-
-def mean_colors(model: Gaussians, views: tuple[View, ...]) -> UInt8[np.ndarray, "N 3"]:
-    """Return sRGB colours: the mean over training cameras that have a Gaussian in their image.
-
-    Cameras count by the inverse square of the distance, as a Gaussian's share of the image does.
-    Gaussians in no image keep the mean over all directions.
-    """
-    base = 0.5 + SH_C0 * model.sh0[:, 0].astype(np.float64)
-    total, weights = np.zeros((len(model), 3)), np.zeros(len(model))
-    chosen = evenly_spaced(len(views), COLOR_VIEWS) if model.shN.size else ()
+    xyz, seen = np.asfortranarray(model.means, np.float64), np.zeros(len(model))
+    chosen = () if model.antialiased else evenly_spaced(len(views), BLUR_VIEWS)
+    weights = np.zeros(len(model))
     for camera in (views[i].camera for i in chosen):
-        seen = points_in_image(camera, model.means).point_idx
-        rays: Float64[np.ndarray, "M 3"] = model.means[seen] - camera.center
-        distance = np.linalg.norm(rays, axis=1)
-        basis = sh_basis(rays / distance[:, None], 1 + model.shN.shape[1])[:, 1:]
-        color = base[seen] + np.einsum("mk,mkc->mc", basis, model.shN[seen])
-        total[seen] += np.clip(color, 0, 1) / distance[:, None] ** 2
-        weights[seen] += 1 / distance**2
-    known = weights > 0
-    base[known] = total[known] / weights[known, None]
-    return np.rint(255 * np.clip(base, 0, 1)).astype(np.uint8)
+        inside = points_in_image(camera, xyz)
+        seen[inside.point_idx] += 1
+        weights[inside.point_idx] += camera.K[0, 0] * camera.K[1, 1] / inside.depth**2
+    blur = np.divide(BLUR * seen, weights, out=np.zeros(len(model)), where=seen > 0)[:, None]
+    squares = np.exp(2 * model.scales.astype(np.float64))
+    if undo:
+        squares = np.maximum(squares / KERNEL - blur, 1e-6 * squares)
+    else:
+        squares = KERNEL * (squares + blur)
+    return replace(model, scales=(np.log(squares) / 2).astype(np.float32))
+
+
+def _start(item: ViewerItem) -> tuple[Camera, Float64[np.ndarray, " 3"]]:
+    """Return the camera at which a page starts, and the point that it can be turned around."""
+    views, scene = item.central_views, item.scene
+    if not views or scene is None:
+        view = orbit([], item.model, 1, DEFAULT_SIZE)[0]
+        return view.camera, np.median(item.model.means.astype(np.float64), axis=0)
+    chosen = choose_image(scene.replace(images=tuple(scene[view.name] for view in views)))
+    start = next(view for view in views if chosen is None or view.name == chosen.name)
+    return start.camera, orbit_center(views, item.model)
+
+
+def _page_from_world(item: ViewerItem, start: Camera) -> Similarity:
+    """Return the transform to the page's frame, in which the first camera looks along z."""
+    frame = viewer_frame(item)
+    up = vertical(item.scene, [view.camera for view in item.central_views])
+    # The camera's x axis is the better guide where it looks up or down.
+    forward = np.cross(start.world_from_cam[:3, 0], -up)
+    forward /= np.linalg.norm(forward)
+    rotation = np.stack([np.cross(-up, forward), -up, forward])
+    return Similarity(frame.scale, rotation, -frame.scale * rotation @ frame.origin)
+
+
+def _fov(camera: Camera) -> float:
+    """Return the field of view over the longer side, degrees, that contains a camera's image."""
+    width, height = camera.width / camera.K[0, 0], camera.height / camera.K[1, 1]
+    return min(math.degrees(2 * math.atan(max(width, ASPECT * height) / 2)), MAX_FOV)
