@@ -14,7 +14,7 @@ from splatseed.depth.stereo import detail
 from splatseed.methods import SOURCE_CODES
 from splatseed.photos import loading
 from splatseed.runtime import memory
-from splatseed.seeding import dense
+from splatseed.seeding import dense, few_photographs
 from splatseed.seeding.dense import SECOND_COMPARISON, plan_comparisons
 
 STEREO, COVER = SOURCE_CODES["stereo"], SOURCE_CODES["cover"]
@@ -23,8 +23,10 @@ BUDGET = 6000
 
 @pytest.fixture(scope="module")
 def few(room):
-    """Six photographs, which is quicker."""
-    return room.replace(images=room.images[:6])
+    """Six photographs, which is quicker, seeded as more would be."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(few_photographs, "MAX_PHOTOGRAPHS", 5)
+        yield room.replace(images=room.images[:6])
 
 
 @pytest.fixture(scope="module")

@@ -135,6 +135,7 @@ def test_a_stray_pose_is_named_and_has_no_part_in_the_frame(room, tmp_path):
         asked = TrainSettings(data_factor=2, test_every=9)
         runs.append(prepare_run(scene, tmp_path / name, asked, note=findings.append))
     assert _bytes(runs[0]) == _bytes(runs[1])
+    findings = [each for each in findings if each.kind != "margins"]
     assert [(each.kind, far.name in each.text) for each in findings] == [("stray-cameras", True)]
 
 
@@ -211,7 +212,7 @@ def test_opacities_are_reset_on_request(begin):
 
 
 def test_results_are_whole_and_in_the_scenes_world(begin, room, draw_curves, score_often):
-    run = begin(max_steps=20)
+    run = begin(max_steps=20, strategy="none")  # without margins, which the curve does not have
     seeds_in_world = run.frame.points_to_world(gaussians_of(run.state.params).means)
     assert np.allclose(seeds_in_world, room.points.xyz, atol=1e-4)
     run.train()
