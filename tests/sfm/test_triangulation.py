@@ -34,19 +34,21 @@ def bare(sixteen_views):
     return sixteen_views[1].replace(points=PointCloud.empty(), tracks=None)
 
 
-def test_points_lie_on_the_surfaces(sixteen_views, views, monkeypatch):
-    points = triangulation.triangulate(views)
+@pytest.fixture(scope="module")
+def points(views):
+    return triangulation.triangulate(views)
+
+
+def test_points_lie_on_the_surfaces(sixteen_views, views, points, monkeypatch):
     assert len(points) > 100
     distance = sixteen_views[0].surfaces.distance(points.xyz.astype(np.float64))
     assert np.median(distance) < 0.02
     assert np.quantile(distance, 0.9) < 0.1
     assert points.confidence.min() == pytest.approx(0.75)  # two further views
-    for threads in (1, 3):
-        monkeypatch.setattr(triangulation, "num_threads", lambda n=threads: n)
-        monkeypatch.setattr(triangulation, "_PER_CHILD", 4)
-        again = triangulation.triangulate(views)
-        assert again.xyz.tobytes() == points.xyz.tobytes()
-        assert again.rgb.tobytes() == points.rgb.tobytes()
+    monkeypatch.setattr(triangulation, "num_threads", lambda: 2)
+    again = triangulation.triangulate(views)
+    assert again.xyz.tobytes() == points.xyz.tobytes()
+    assert again.rgb.tobytes() == points.rgb.tobytes()
 
 
 def test_masked_pixels_have_no_points(views):
@@ -86,32 +88,23 @@ def test_the_best_match_is_near_the_line_and_clearly_the_best():
     assert out.tolist() == [0, 1, -1, -1]
 
 
-def test_auto_adds_them_where_there_are_no_points(bare):
-    notes = []
-    cloud = ss.upsample(bare, "auto", note=notes.append)
-    found = next(note for note in notes if note.kind == "triangulated-points")
-    num = int(found.text.split()[0].replace(",", ""))
-    views = read_views(bare, bare.images, 800, silent)
-    points = triangulation.triangulate(views)
-    assert num == len(points)
-    assert cloud.xyz[:num].tobytes() == points.xyz.tobytes()
-    assert (cloud.source[:num] == source_code("stereo")).all()
-    few = ss.upsample(bare, "auto", budget=500)
-    assert len(few) <= 500
-
-
-@pytest.mark.parametrize("missing", [MissingDependencyError("pycolmap", found="none", fix="Get it")])
-def test_auto_does_without(bare, monkeypatch, missing):
+def test_auto_adds_them_where_there_are_no_points(bare, points, monkeypatch):
     def fail(*_):
-        raise missing
+        raise MissingDependencyError("pycolmap", found="none", fix="Get it")
 
-    monkeypatch.setattr(triangulation, "triangulate", fail)
-    notes = []
-    cloud = ss.upsample(bare, "auto", note=notes.append)
-    found = next(note for note in notes if note.kind == "points-not-triangulated")
-    assert found.fix == "Get it"
-    monkeypatch.setattr(triangulation, "triangulate", lambda *_: PointCloud.empty())
-    assert ss.upsample(bare, "auto").xyz.tobytes() == cloud.xyz.tobytes()
+    clouds, notes = [], {}
+    for made in (lambda *_: points, fail):
+        monkeypatch.setattr(triangulation, "triangulate", made)
+        found = []
+        clouds.append(ss.upsample(bare, "auto", note=found.append))
+        notes |= {note.kind: note for note in found}
+    both, stereo = clouds
+    assert notes["triangulated-points"].text.startswith(f"{len(points):,} points")
+    assert notes["points-not-triangulated"].fix == "Get it"
+    assert both.xyz[: len(points)].tobytes() == points.xyz.tobytes()
+    one, two = (cloud.xyz[cloud.source == source_code("stereo")] for cloud in clouds)
+    assert one[len(points) :].tobytes() == two.tobytes()
+    assert len(both) < len(stereo) + len(points)  # cover leaves their cells out
 
 
 def test_auto_leaves_scenes_with_points_as_they_are(sixteen_views, monkeypatch):
