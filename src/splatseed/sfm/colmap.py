@@ -16,6 +16,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar, get_args
 
 import numpy as np
 from jaxtyping import Float64, UInt8
+from PIL import Image as PilImage
 
 from splatseed import errors
 from splatseed.progress import Progress
@@ -104,9 +105,9 @@ class Features(NamedTuple):
 
 
 def find_features(
-    greys: Sequence[UInt8[np.ndarray, "H W"]], num: int, progress: Progress
+    greys: Sequence[UInt8[np.ndarray, "H W"]], zoom: float, num: int, progress: Progress
 ) -> list[Features]:
-    """Find about ``num`` SIFT features, at most, in each grey photograph, as it is (not doubled).
+    """Find about ``num`` SIFT features, at most, in each grey photograph, enlarged by ``zoom``.
 
     A job of a child process.
     """
@@ -119,8 +120,12 @@ def find_features(
     found = []
     for number, grey in enumerate(greys):
         progress("find features", number / len(greys))
-        points, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(grey))
+        height, width = grey.shape
+        size = round(zoom * width), round(zoom * height)
+        enlarged = np.array(PilImage.fromarray(grey).resize(size, PilImage.Resampling.BICUBIC))
+        points, descriptors = extractor.extract_from_uint8_array(enlarged)
         uv = np.array([(point.x, point.y) for point in points], np.float64).reshape(-1, 2)
+        uv *= np.array([width, height]) / size
         found.append(Features(uv, np.array(descriptors.data, np.uint8).reshape(-1, 128)))
     return found
 

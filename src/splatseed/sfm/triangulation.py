@@ -1,8 +1,7 @@
 """Points at known poses from features of small photographs, within seconds.
 
-``splatseed sfm`` finds more, in ten times the time: here photographs have the size of stereo,
-features are not doubled, and only nearby views that look the same way are matched, along epipolar
-lines, which needs no verification by RANSAC.
+``splatseed sfm`` finds more, in ten times the time: here photographs have the size of stereo, and
+only nearby views that look the same way are matched, along epipolar lines, which needs no RANSAC.
 
 Notation: V views; view i has M features at ``uv`` [M, 2], pixels. A feature's *matches* are one
 feature in each of K partners, -1 for none. Promise: the same photographs give the same bytes,
@@ -35,6 +34,9 @@ from splatseed.sfm.first_look import Pair
 class _Settings:
     partners: int = 8
     """Views that each is matched with, at least."""
+    zoom: float = 1.4
+    """By which photographs are enlarged: 1 gives a third to a half of the points, in half of the
+    time, and doubling 1.3 to 1.9 times as many in twice the time; none is more accurate."""
     max_features: int = 2000
     max_distance: float = 2.0
     """Between a feature and the epipolar line of its match, pixels."""
@@ -81,7 +83,8 @@ def triangulate(views: Sequence[View], progress: Progress = silent) -> PointClou
         if partners:
             found = np.stack([matches[i, j] for j in partners])
             parts.append(_points_of(i, partners, found, views, features, used))
-    return PointCloud.concatenate(*parts)
+    points = PointCloud.concatenate(*parts)
+    return points.select(points.distinct)  # a corner of two orientations is two features
 
 
 def _detect(views: Sequence[View], progress: Progress) -> list[Features]:
@@ -89,8 +92,9 @@ def _detect(views: Sequence[View], progress: Progress) -> list[Features]:
     greys = [grey_image(view.photograph) for view in views]
     parts = max(1, min(num_threads(), len(views) // _PER_CHILD))
     bounds = [len(views) * part // parts for part in range(parts + 1)]
+    how = SETTINGS.zoom, SETTINGS.max_features
     children = [
-        Child(find_features, greys[start:stop], SETTINGS.max_features, reports=True)
+        Child(find_features, greys[start:stop], *how, reports=True)
         for start, stop in pairwise(bounds)
     ]
     found: list[Features] = []
