@@ -196,8 +196,8 @@ def _seeds(scene: Scene, arm: str, settings: TrainSettings) -> PointCloud:
     if kept := chosen.pop("kept", None):
         drawn = np.random.default_rng(settings.seed).permutation(len(scene.points))[:kept]
         scene = scene.replace(points=scene.points.select(np.sort(drawn)), tracks=None)
-    for how in ("refined", "triangulated"):
-        chosen.pop(how, None)
+    for each in ("refined", "triangulated"):
+        chosen.pop(each, None)
     name = chosen.pop("method")
     size = stereo_size(scene.split(TEST_EVERY)[0], settings, "cpu")
     known = {field.name for field in dataclasses.fields(ss.METHODS[name])}
