@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from splatseed.photos.loading import load_views
 from splatseed.splat.from_seeds import initial_gaussians
 from splatseed.splat.rendering import ModelRenderer
 from splatseed.splat.training_frame import training_frame
-from splatseed.training.margins import SHARE, continued, with_margins
+from splatseed.training.margins import MAX_PHOTOGRAPHS, SHARE, continued, has_margins, with_margins
+from splatseed.training.settings import TrainSettings
 
 
 def test_values_continue_smoothly_and_known_ones_stay():
@@ -41,20 +44,20 @@ def test_a_view_beyond_the_frames_is_no_longer_black(room):
     cap = len(model) + added // 2
     capped = with_margins(model, frame, views, cap)
     assert len(capped) <= cap
-    assert len(capped) - len(np.intersect1d(capped.means[:, 0], model.means[:, 0])) <= SHARE * cap + 1
+    assert (
+        len(capped) - len(np.intersect1d(capped.means[:, 0], model.means[:, 0])) <= SHARE * cap + 1
+    )
 
     def black(gaussians, view):
         return (ModelRenderer(gaussians, frame).color(view).sum(axis=2) < 0.02).mean()
 
-    wide = [w for w in (_wider(view) for view in views)]
+    wide = [_wider(view) for view in views]
     before, after = (np.mean([black(each, view) for view in wide]) for each in (model, grown))
     assert after < 0.5 * before
 
 
 def _wider(view):
     """The view with a frame that is wider by a fifth on each side."""
-    import dataclasses
-
     K = view.K.copy()
     right, down = view.width // 5, view.height // 5
     K[:2, 2] += [right, down]
@@ -62,3 +65,12 @@ def _wider(view):
         view.camera, K=K, width=view.width + 2 * right, height=view.height + 2 * down
     )
     return dataclasses.replace(view, camera=camera, photograph=np.empty((0, 0, 3), np.uint8))
+
+
+def test_few_whole_photographs_alone_have_margins(room):
+    views = load_views(room, room.images)[:MAX_PHOTOGRAPHS]
+    settings = TrainSettings()
+    assert has_margins(settings, views[:3])
+    assert not has_margins(dataclasses.replace(settings, start="model.ply"), views[:3])
+    assert not has_margins(dataclasses.replace(settings, strategy="default-3dgs"), views[:3])
+    assert not has_margins(settings, [*views] * 2)

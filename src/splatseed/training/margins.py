@@ -23,8 +23,7 @@ from splatseed.seeding.few_photographs import MAX_PHOTOGRAPHS
 from splatseed.splat.gaussians import SH_C0, Gaussians
 from splatseed.splat.rendering import ModelRenderer
 from splatseed.splat.training_frame import TrainingFrame
-
-__all__ = ["MAX_PHOTOGRAPHS", "with_margins"]
+from splatseed.training.settings import TrainSettings
 
 SIDE = 512
 """Longer side, about, at which views are rendered, in pixels."""
@@ -34,8 +33,24 @@ STEP = 4
 """Minimum distance of Gaussians, in pixels of the rendered view."""
 SHARE = 0.1
 """Maximum number of Gaussians of margins, as a fraction of the cap."""
-SIZE = 0.7  # standard deviation of a Gaussian, in steps
+SIZE = 0.7  # standard deviation of a Gaussian, and its minimum distance from the frame, in steps
 OPACITY = 0.9
+
+
+def has_margins(settings: TrainSettings, views: Sequence[View]) -> bool:
+    """Whether the model of a run gets margins: with few photographs that show all there is.
+
+    Not of 3DGS as published, of a run that continues one, or of objects cut out.
+    """
+    cut_out = any(view.empty is not None or view.opacity is not None for view in views)
+    few = len(views) <= MAX_PHOTOGRAPHS
+    return few and not settings.as_3dgs and settings.start is None and not cut_out
+
+
+def with_room(settings: TrainSettings) -> TrainSettings:
+    """Return settings whose cap leaves room for the margins."""
+    cap = settings.cap
+    return settings if cap is None else replace(settings, cap_max=max(2, round((1 - SHARE) * cap)))
 
 
 def with_margins(
@@ -47,7 +62,7 @@ def with_margins(
 ) -> Gaussians:
     """Add the margins of the training views to a model; both are in the scene's frame.
 
-    With a ``cap`` on the number of Gaussians, the faintest make room.
+    With a ``cap`` on the number of Gaussians, the faintest make room if they have to.
     """
     renderer = ModelRenderer(model, frame, device)
     small = [_reduced(view) for view in views]
@@ -63,22 +78,19 @@ def with_margins(
     if cap is not None and len(model) + len(xyz) > cap:
         order = np.argsort(-model.opacities, kind="stable")[: cap - len(xyz)]
         model = model.select(np.sort(order))
-    quats = np.tile(np.array([1, 0, 0, 0], np.float32), (len(xyz), 1))
     added = {
         "means": xyz,
         "scales": np.repeat(np.log(sizes)[:, None], 3, axis=1),
-        "quats": quats,
+        "quats": np.tile([1.0, 0.0, 0.0, 0.0], (len(xyz), 1)),
         "opacities": np.full(len(xyz), np.log(OPACITY / (1 - OPACITY))),
         "sh0": ((colors - 0.5) / SH_C0)[:, None],
         "shN": np.zeros((len(xyz), *model.shN.shape[1:])),
     }
-    return replace(
-        model,
-        **{
-            name: np.concatenate([array, added[name].astype(np.float32)])
-            for name, array in model.arrays().items()
-        },
-    )
+    grown = {
+        name: np.concatenate([array, added[name].astype(np.float32)])
+        for name, array in model.arrays().items()
+    }
+    return Gaussians(**grown, antialiased=model.antialiased)
 
 
 def _reduced(view: View) -> View:
@@ -112,12 +124,10 @@ def _margin(
     around = _width((camera.height, camera.width))
     row, column = np.mgrid[step // 2 : len(values) : step, step // 2 : values.shape[1] : step]
     uv = np.stack([column.ravel(), row.ravel()], axis=1) + 0.5 - around
-    colors, inverse = (
-        values[row.ravel(), column.ravel(), :3],
-        values[row.ravel(), column.ravel(), 3],
-    )
+    continuation = values[row.ravel(), column.ravel()]
+    colors, inverse = continuation[:, :3], continuation[:, 3]
     beyond = _beyond(uv, camera)
-    used = (beyond > 0) & (inverse > 0)
+    used = (beyond > SIZE * step) & (inverse > 0)
     uv, z, beyond = uv[used], 1.0 / inverse[used], beyond[used]
     xyz = camera.unproject(uv, z)
     kept = _unseen(xyz, i, views, beyond)

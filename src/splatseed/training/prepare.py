@@ -50,6 +50,7 @@ from splatseed.training.depths import NOT_CACHED, DepthCache, ImageDepths, known
 from splatseed.training.device import check_fits, device_name, pick_device
 from splatseed.training.folder import RunFolder
 from splatseed.training.initialization import first_gaussians
+from splatseed.training.margins import has_margins, with_room
 from splatseed.training.request import NEW_RUN, PrepareOptions
 from splatseed.training.run import TrainingRun
 from splatseed.training.seeds import no_seeding_reason, seeded, seeds_facts, usable_seeds
@@ -287,7 +288,15 @@ def _state(
 ) -> TrainState:
     """Return the state of the checkpoint, or before the first step; ``views`` are for training."""
     settings, device = setup.settings, setup.device
-    strategy = make_strategy(settings, device, depths, len(depths) / max(1, len(views)))
+    growing = settings
+    if has_margins(settings, views):
+        growing = with_room(settings)
+        text = (
+            "What lies past the edges of the few photographs is continued from what they show: "
+            "no photograph shows it."
+        )
+        setup.note(Finding("margins", text, "info"))
+    strategy = make_strategy(growing, device, depths, len(depths) / max(1, len(views)))
     checkpoint = setup.folder.checkpoint
     if setup.earlier and checkpoint.is_file():
         state = load_checkpoint(checkpoint, strategy, settings.schedule, device)

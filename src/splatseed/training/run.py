@@ -29,7 +29,7 @@ from splatseed.splat.rendering import ModelRenderer
 from splatseed.splat.training_frame import TrainingFrame
 from splatseed.training.device import device_name
 from splatseed.training.folder import Record, RunFolder, write_curve_csv, write_curve_png
-from splatseed.training.margins import MAX_PHOTOGRAPHS, with_margins
+from splatseed.training.margins import has_margins, with_margins
 from splatseed.training.parameters import gaussians_of, take_mean
 from splatseed.training.settings import TrainSettings
 from splatseed.training.state import TrainState, save_checkpoint
@@ -164,12 +164,10 @@ class TrainingRun:
     def _model(self) -> Gaussians:
         """Return the Gaussians in the scene's frame; with margins, if photographs are few."""
         model = self.frame.gaussians_to_world(gaussians_of(self.state.params))
-        settings, views = self.settings, self._train_views
-        continued = settings.start is not None  # its Gaussians have margins, if any
-        cut_out = any(view.empty is not None or view.opacity is not None for view in views)
-        if len(views) > MAX_PHOTOGRAPHS or settings.as_3dgs or continued or cut_out:
+        views, cap = self._train_views, self.settings.cap
+        if not has_margins(self.settings, views):
             return model
-        return with_margins(model, self.frame, views, settings.cap, self.trainer.device)
+        return with_margins(model, self.frame, views, cap, self.trainer.device)
 
     def _draw(
         self, view: View, render: Float32[np.ndarray, "H W 3"], errors: Float32[np.ndarray, "H W"]
