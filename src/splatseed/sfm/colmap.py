@@ -116,6 +116,12 @@ def find_features(
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
     sift = {"first_octave": 0, "max_num_features": num}
     options = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False, sift=sift)
+    if not hasattr(pycolmap, "FeatureExtractor"):
+        raise errors.MissingDependencyError(
+            "a pycolmap that finds features in arrays",
+            found=f"pycolmap {pycolmap.__version__}",
+            fix=f"Install a newer one (extra sfm): {install_command('pycolmap', upgrade=True)}.",
+        )
     extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
     found = []
     for number, grey in enumerate(greys):
