@@ -6,8 +6,10 @@ Each capture's points are taken away. The *random start* is what gsplat begins w
 trained with ``default`` and with ``grow``; once more with ``--refine-poses``, whose triangulated
 points guide it. SfM's own points, under ``default``, show what could be had. Captures without, such
 as a phone's, are trained at refined poses from a random start and from the triangulated points
-alone, too. All have the same number of Gaussians at most, ``rho`` per pixel. Seconds are the
-processor's, on one thread, and of triangulation by the clock.
+alone, too. Rivals that cost nothing are a random start under ``mcmc``, the points that ``splatseed
+sfm --poses-from`` triangulates at the poses as given, and other trainers' random starts. All have
+the same number of Gaussians at most, ``rho`` per pixel. Seconds are the processor's, on one thread,
+and of triangulation by the clock.
 
 Promise: nothing is chosen by hand. The *gain* of a view or a capture is the PSNR of ours with
 ``grow`` minus that of the random start at equal seconds; the picture shows the capture, and of it
@@ -37,7 +39,8 @@ from benchmarks.common.clouds import find_scenes
 from benchmarks.common.ledger import report
 from benchmarks.common.machine import describe
 from benchmarks.common.markdown import table
-from benchmarks.training.seeding_arms import at_refined_poses
+from benchmarks.training.peer_starts import PEERS, peer_start
+from benchmarks.training.seeding_arms import at_given_poses, at_refined_poses
 from jaxtyping import UInt8
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -72,6 +75,12 @@ ARMS = {
     "refined": "--refine-poses, auto + grow",
     "random, refined": "--refine-poses, random start",
     "triangulated": "--refine-poses, its points + grow",
+    "random, mcmc": "random start + mcmc",
+    "given, default": "triangulated at the poses",
+    "given, grow": "triangulated at the poses + grow",
+    "nerfstudio": "nerfstudio's random start",
+    "brush": "Brush's random start",
+    "lichtfeld": "LichtFeld's random start",
     "sfm": "SfM's points",
 }
 OURS: dict[str, StrategyName] = {"grow": "grow", "auto": "default"}
@@ -205,6 +214,17 @@ def train_all(
     posed = at_refined_poses(bare, 0)
     refining = time.perf_counter() - begun
     at_refined = {"refined": train(posed, "grow", seeding="auto")}
+    begun = time.perf_counter()
+    start = at_given_poses(bare, 0)
+    triangulating = time.perf_counter() - begun
+    for strategy in OURS.values():
+        trained = train(start, strategy)
+        name = f"given, {strategy}"
+        runs[name] = trained._replace(seconds=trained.seconds + triangulating)
+    for name in PEERS[1:]:
+        start = bare.replace(points=peer_start(bare, np.random.default_rng(0), name))
+        runs[name] = train(start, "default")
+    runs["random, mcmc"] = train(dice, "mcmc")
     if not len(whole.points):  # a device's poses
         start = posed.replace(points=random_start(posed, np.random.default_rng(0)))
         at_refined["random, refined"] = train(start, "default")

@@ -11,27 +11,28 @@ import dataclasses
 import os
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from benchmarks.training.peer_starts import peer_start
 
 import splatseed as ss
-from splatseed.checkup.poses import random_start
+from splatseed.io.photograph import photograph_folder
 from splatseed.io.staging import atomic_file
 from splatseed.methods import configure
 from splatseed.pointcloud import PointCloud
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Scene, Split
-from splatseed.sfm import refined
+from splatseed.sfm import Settings, reconstruct, refined
 from splatseed.splat.evaluate import evaluate_views
 from splatseed.training import TrainSettings, prepare_run
 from splatseed.training.depths import stereo_size
 from splatseed.training.folder import Record
 from splatseed.training.trainer import Trainer
 
-__all__ = ["ARMS", "TEST_EVERY", "at_refined_poses", "train", "validation_split"]
+__all__ = ["ARMS", "TEST_EVERY", "at_given_poses", "at_refined_poses", "train", "validation_split"]
 
 ARMS: Mapping[str, Mapping[str, Any]] = {
     "sfm": {"method": "linear", "ratio": 1},
@@ -46,9 +47,13 @@ ARMS: Mapping[str, Mapping[str, Any]] = {
     "auto, 1,500 of sfm": {"method": "auto", "dense": False, "kept": 1500},
     "auto, refined": {"method": "auto", "dense": False, "refined": True},
     "triangulated": {"method": "linear", "ratio": 1, "refined": True},
+    "triangulated at given poses": {"method": "linear", "ratio": 1, "triangulated": True},
     "dense": {"method": "auto"},
     "dense, no points": {"method": "auto", "points": False},
     "random as gsplat": {"random": "gsplat"},
+    "random as nerfstudio": {"random": "nerfstudio"},
+    "random as Brush": {"random": "brush"},
+    "random as LichtFeld": {"random": "lichtfeld"},
     "random, refined": {"random": "gsplat", "refined": True},
 }
 """How seeds are made, by what the table calls them; *photographs alone* leaves out the depth maps
@@ -56,7 +61,8 @@ that come with a capture; at ratio 1 nothing is added to SfM's points, and witho
 taken away first; *refined* is with ``--refine-poses``, which triangulates others in their place,
 also where poses are exact and stay; *dense* are as many as the budget allows, and auto's others are
 those of ``splatseed train``. SfM's points were made from all photographs, those held out too;
-*triangulated* are only those of the features of the training photographs."""
+*triangulated* are only those of the features of the training photographs; *random as* are those of
+other trainers (``peer_starts.py``)."""
 TEST_EVERY = 8
 HELD_STEP = 3
 """Runs of seed s hold out every eighth view from the one of number 3 s (mod 8) on."""
@@ -85,12 +91,14 @@ def train(
     key = fingerprint(Path(scene).name, ARMS[arm], *plan)
     file = Path(kept) / f"{key}.npz" if kept else None
     seeding = seeding_processor = 0.0
-    if ARMS[arm].get("refined", False):
-        key = fingerprint(Path(scene).name, "refined", seed, every)
-        poses = Path(kept) / f"{key}.npz" if kept else None
-        validation, seeding, seeding_processor = _known_poses(validation, seed, poses)
-    points, *took = _known_seeds(validation, arm, settings, file)
-    seeding, seeding_processor = seeding + took[0], seeding_processor + took[1]
+    for how, place in (("refined", at_refined_poses), ("triangulated", at_given_poses)):
+        if ARMS[arm].get(how, False):
+            key = fingerprint(Path(scene).name, how, seed, every)
+            poses = Path(kept) / f"{key}.npz" if kept else None
+            validation, *took = _known_poses(validation, seed, place, poses)
+            seeding, seeding_processor = took
+    points, *more = _known_seeds(validation, arm, settings, file)
+    seeding, seeding_processor = seeding + more[0], seeding_processor + more[1]
     begun = time.process_time() - seeding_processor
     with tempfile.TemporaryDirectory() as folder:
         run = prepare_run(validation.replace(points=points), Path(folder) / "run", settings)
@@ -182,13 +190,14 @@ def _seeds(scene: Scene, arm: str, settings: TrainSettings) -> PointCloud:
     """
     chosen = dict(ARMS[arm])
     if "random" in chosen:
-        return random_start(scene, np.random.default_rng(settings.seed), chosen["random"])
+        return peer_start(scene, np.random.default_rng(settings.seed), chosen["random"])
     if not chosen.pop("points", True):
         scene = scene.replace(points=PointCloud.empty(), tracks=None)
     if kept := chosen.pop("kept", None):
         drawn = np.random.default_rng(settings.seed).permutation(len(scene.points))[:kept]
         scene = scene.replace(points=scene.points.select(np.sort(drawn)), tracks=None)
-    chosen.pop("refined", None)
+    for each in ("refined", "triangulated"):
+        chosen.pop(each, None)
     name = chosen.pop("method")
     size = stereo_size(scene.split(TEST_EVERY)[0], settings, "cpu")
     known = {field.name for field in dataclasses.fields(ss.METHODS[name])}
@@ -199,8 +208,10 @@ def _seeds(scene: Scene, arm: str, settings: TrainSettings) -> PointCloud:
     return points.select(points.distinct)
 
 
-def _known_poses(scene: Scene, seed: int, file: Path | None) -> tuple[Scene, float, float]:
-    """The scene at refined poses, from a file of an earlier run if there is one.
+def _known_poses(
+    scene: Scene, seed: int, place: Callable[[Scene, int], Scene], file: Path | None
+) -> tuple[Scene, float, float]:
+    """The scene as ``place`` makes it, from a file of an earlier run if there is one.
 
     Also returns the seconds that it took, by the clock and by the processors of the child process.
     """
@@ -216,7 +227,7 @@ def _known_poses(scene: Scene, seed: int, file: Path | None) -> tuple[Scene, flo
         points = PointCloud(kept["xyz"], kept["rgb"])
         return scene.replace(images=images, points=points, tracks=None), *kept["seconds"].tolist()
     start, before = time.perf_counter(), os.times()
-    found = at_refined_poses(scene, seed)
+    found = place(scene, seed)
     after = os.times()
     processor = after.children_user - before.children_user
     took = time.perf_counter() - start, processor + after.children_system - before.children_system
@@ -240,3 +251,19 @@ def at_refined_poses(scene: Scene, seed: int) -> Scene:
         seed: Seed of every random choice.
     """
     return refined(scene, seed, test_every=TEST_EVERY)[0]
+
+
+def at_given_poses(scene: Scene, seed: int) -> Scene:
+    """The scene with points triangulated at its poses, from features of its training photographs.
+
+    Arguments as for ``at_refined_poses``.
+    """
+    test = {image.name for image in scene.split(TEST_EVERY)[1]}
+    with tempfile.TemporaryDirectory() as folder:
+        output = Path(folder) / "scene"
+        reconstruct(
+            photograph_folder(scene), output, Settings(seed=seed), poses_from=scene,
+            test_names=test, masks=scene.masks, keep=False,
+        )  # fmt: skip
+        points = ss.load_scene(output).points
+    return scene.replace(points=PointCloud(points.xyz, points.rgb), tracks=None)

@@ -6,14 +6,16 @@ import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 pytest.importorskip("torch", reason="training needs PyTorch")
 
 from splatseed.io import load_scene
+from splatseed.photos.visibility import points_in_image
 from splatseed.training.folder import Record
 
-MODULES = ("training.seeding", "training.seeding_arms")
+MODULES = ("training.seeding", "training.seeding_arms", "training.peer_starts")
 PLAN = {"strategy": "none", "rho": 0.2, "max_steps": 20, "data_factor": 1, "seed": 0, "every": 1}
 
 
@@ -102,3 +104,18 @@ def test_runs_in_the_ledger_are_not_repeated_and_gains_are_over_the_first_arm(
     assert rows == [sfm, auto] * 2
     assert sfm[3:] == ["21.00 / 0.5000 (1.0k, 0.5k seeds, 1 + 2 s)"] * 2 + ["21.00 / 0.5000", ""]
     assert auto[-2:] == ["22.50 / 0.5100", "+1.50 ± 0.50 / +0.010"]
+
+
+def test_other_trainers_start_where_their_rules_say(bench, room):
+    draw = bench.peer_starts.peer_start
+    cube = draw(room, np.random.default_rng(0), "lichtfeld")
+    assert len(cube) == 10_000
+    np.testing.assert_allclose(np.ptp(cube.xyz, axis=0), 2, atol=0.01)
+    frusta = draw(room, np.random.default_rng(0), "brush")
+    assert len(frusta) == 10_000
+    seen = np.zeros(len(frusta), np.bool_)
+    for image in room.images:
+        seen[points_in_image(image.camera, frusta.xyz).point_idx] = True
+    assert seen.all()
+    assert frusta.rgb.min() >= 127  # coefficients from 0 to 1 are added to grey
+    assert frusta.rgb.max() <= 200

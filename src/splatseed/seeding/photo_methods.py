@@ -17,13 +17,18 @@ import numpy as np
 
 from splatseed.depth.stereo.maps import MAX_GRID, MIN_POINTS, StereoSettings
 from splatseed.depthmap import MIN_CONFIDENCE, in_scene_units
-from splatseed.errors import PointCloudError, SceneNotFoundError
+from splatseed.errors import (
+    MissingDependencyError,
+    PointCloudError,
+    SceneNotFoundError,
+    TaskLostError,
+)
 from splatseed.findings import Finding
 from splatseed.methods import Traits, source_code
 from splatseed.photos.loading import load_views
 from splatseed.photos.sizes import factor_for_size
 from splatseed.photos.view import View, camera_views
-from splatseed.pointcloud import PointCloud
+from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Note, Progress, StageTimes, silent_note, watched
 from splatseed.scene import Image, Scene
 from splatseed.settings import Range, check_settings
@@ -120,17 +125,21 @@ class Stereo(PhotographMethod):
             found = _confirmed_share(scene, stereo, time.perf_counter() - start)
             for finding in (*found, *findings, *mismatch):
                 note(finding)
+            triangulated = self.triangulate(scene, views, timed, note)
+            if len(triangulated):  # known from here on, like a scene's points
+                scene = scene.replace(points=triangulated.with_source(ORIGINAL), tracks=None)
             points = self.fill(scene, seeds, stereo, rng, timed, note)
         if on_stereo is not None:
             on_stereo(stereo)
         if budget is None or not self.dense or self.fills_pixels(scene, len(views)):
-            return points
+            return PointCloud.concatenate(triangulated, points)
         first = Comparison(images, stereo, self.max_size, self.spacing, times.seconds())
 
         def refill(denser: PointCloud) -> PointCloud:
             return self.fill(scene, denser, stereo, rng, progress, silent_note)
 
-        return fill_budget(scene, first, points, budget, refill, rng, progress, note)
+        points = fill_budget(scene, first, points, budget, refill, rng, progress, note)
+        return PointCloud.concatenate(triangulated, points)
 
     def _guided(self, scene: Scene, images: Sequence[Image]) -> tuple[Scene, tuple[Finding, ...]]:
         """Return the scene without depth maps that stereo must not start at, and why."""
@@ -165,6 +174,12 @@ class Stereo(PhotographMethod):
     def fills_pixels(self, scene: Scene, num_views: int) -> bool:
         """Whether ``fill`` makes seeds as dense as the pixels; this method does not."""
         return False
+
+    def triangulate(
+        self, scene: Scene, views: Sequence[View], progress: Progress, note: Note
+    ) -> PointCloud:
+        """Triangulate points of features as further seeds; this method does not."""
+        return PointCloud.empty()
 
 
 @dataclass(frozen=True)
@@ -224,7 +239,7 @@ class Auto(Stereo):
             text = f"Few photographs ({num}): a seed every two pixels, at a depth that semi-global "
             note(Finding("few-photographs", f"{text}matching infers for all of them.", "info"))
             return pixel_seeds(stereo.views, known.xyz.astype(np.float64), progress)
-        if self.depth_maps and in_scene_units(scene.depths):
+        if self._has_measured(scene):
             measured = self._from_maps(scene, stereo, known, progress, note)
             seeds = PointCloud.concatenate(seeds, measured)
             known = PointCloud.concatenate(known, measured)
@@ -235,8 +250,31 @@ class Auto(Stereo):
         """Whether photographs are so few that each pixel needs a depth; not if maps have it."""
         from splatseed.seeding.few_photographs import MAX_PHOTOGRAPHS
 
-        measured = self.depth_maps and in_scene_units(scene.depths)
-        return 2 <= num_views <= MAX_PHOTOGRAPHS and not measured
+        return 2 <= num_views <= MAX_PHOTOGRAPHS and not self._has_measured(scene)
+
+    def triangulate(
+        self, scene: Scene, views: Sequence[View], progress: Progress, note: Note
+    ) -> PointCloud:
+        """Triangulate points of features, if there are neither points nor measured depths."""
+        known = len(scene.points.originals) or self._has_measured(scene)
+        if known or self.fills_pixels(scene, len(views)):
+            return PointCloud.empty()
+        try:
+            from splatseed.sfm.triangulation import triangulate
+
+            points = triangulate(views, progress)
+        except (MissingDependencyError, TaskLostError) as error:
+            text = "No points are triangulated, which auto would add to those of stereo: expected "
+            text += f"{error.expected}, found {error.found}."
+            note(Finding("points-not-triangulated", text, "info", fix=error.fix))
+            return PointCloud.empty()
+        text = f"{len(points):,} points are triangulated from features, at the poses as given."
+        note(Finding("triangulated-points", text, "info"))
+        return points.with_source(source_code("stereo"))
+
+    def _has_measured(self, scene: Scene) -> bool:
+        """Whether the scene has measured depth maps that count."""
+        return self.depth_maps and in_scene_units(scene.depths)
 
     def _from_maps(
         self, scene: Scene, stereo: StereoResult, known: PointCloud, progress: Progress, note: Note

@@ -12,9 +12,11 @@ from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, TypeVar, get_args
+from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar, get_args
 
 import numpy as np
+from jaxtyping import Float64, UInt8
+from PIL import Image as PilImage
 
 from splatseed import errors
 from splatseed.camera import Intrinsics
@@ -96,6 +98,45 @@ def require_pycolmap(device: DeviceName = "auto") -> Any:
             fix="Pass `device='cpu'`, or install a CUDA build of pycolmap.",
         )
     return pycolmap
+
+
+class Features(NamedTuple):
+    """Features of a photograph."""
+
+    uv: Float64[np.ndarray, "M 2"]  # pixels, centres at +0.5
+    descriptors: UInt8[np.ndarray, "M 128"]
+
+
+def find_features(
+    greys: Sequence[UInt8[np.ndarray, "H W"]], zoom: float, num: int, progress: Progress
+) -> list[Features]:
+    """Find about ``num`` SIFT features, at most, in each grey photograph, enlarged by ``zoom``.
+
+    A job of a child process.
+    """
+    pycolmap = require_pycolmap("cpu")
+    pycolmap.logging.logtostderr = True  # not to files in the temporary folder
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
+    sift = {"first_octave": 0, "max_num_features": num}
+    options = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False, sift=sift)
+    if not hasattr(pycolmap, "FeatureExtractor"):
+        raise errors.MissingDependencyError(
+            "a pycolmap that finds features in arrays",
+            found=f"pycolmap {pycolmap.__version__}",
+            fix=f"Install a newer one (extra sfm): {install_command('pycolmap', upgrade=True)}.",
+        )
+    extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+    found = []
+    for number, grey in enumerate(greys):
+        progress("find features", number / len(greys))
+        height, width = grey.shape
+        size = round(zoom * width), round(zoom * height)
+        enlarged = np.array(PilImage.fromarray(grey).resize(size, PilImage.Resampling.BICUBIC))
+        points, descriptors = extractor.extract_from_uint8_array(enlarged)
+        uv = np.array([(point.x, point.y) for point in points], np.float64).reshape(-1, 2)
+        uv *= np.array([width, height]) / size
+        found.append(Features(uv, np.array(descriptors.data, np.uint8).reshape(-1, 128)))
+    return found
 
 
 @dataclass(frozen=True)
