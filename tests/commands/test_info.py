@@ -42,6 +42,7 @@ def test_a_colmap_scene(room, splatseed, monkeypatch):
     assert rows["format"] == "colmap"
     assert rows["cameras"] == "1 PINHOLE 96x72"
     assert rows["images"] == "12 (10 to train, 2 to test)"
+    assert rows["few photographs"].startswith("method auto gives every second pixel a seed")
     assert rows["points"] == f"{len(scene.points):,}"
     assert rows["depth maps"].startswith("12 beside the photographs; method depth aligns")
     assert rows["track length, images"].startswith(f"mean {scene.tracks.lengths.mean():.3g},")

@@ -44,7 +44,7 @@ from splatseed.scene import Scene
 from splatseed.seeding import diagnostics
 from splatseed.seeding.advice import Advice, advice_for, is_distorted, untrainable
 from splatseed.seeding.clouds.point_colors import missing_color_findings
-from splatseed.seeding.photo_methods import photographed
+from splatseed.seeding.photo_methods import Auto, photographed
 from splatseed.text import counted, quoted, visible
 from splatseed.training.folder import RunFolder
 from splatseed.training.schedule import FULL_RUN
@@ -351,6 +351,7 @@ def _facts_of(scene: Scene) -> dict[str, Any]:
         "train_images": len(train),
         "test_images": len(test),
         "photographs": scene.has_photographs,
+        "few_photographs": _has_pixel_seeds(scene),
         "cameras": [
             {"id": c.camera_id, "model": c.model, "width": c.width, "height": c.height}
             for c in _cameras(scene)
@@ -376,11 +377,21 @@ def _source_rows(scene: Scene) -> list[tuple[str, str]]:
     train, test = scene.split(scene.default_test_every)
     by = f", by its {scene.listed.origin}" if scene.listed else ""
     images = f"{len(scene.images):,} ({len(train):,} to train, {len(test):,} to test{by})"
-    return [
+    rows = [
         ("format", scene.source.format),
         ("cameras", ", ".join(cameras) or "none"),
         ("images", images if scene.images else "none"),
     ]
+    if _has_pixel_seeds(scene):
+        few = "method auto gives every second pixel a seed; docs/few_photographs.md"
+        rows.append(("few photographs", few))
+    return rows
+
+
+def _has_pixel_seeds(scene: Scene) -> bool:
+    """Whether method auto takes the training photographs for few."""
+    train, _ = scene.split(scene.default_test_every)
+    return scene.has_photographs and Auto().fills_pixels(scene, len(train))
 
 
 def _depth_map_rows(
