@@ -212,7 +212,7 @@ def test_opacities_are_reset_on_request(begin):
 
 
 def test_results_are_whole_and_in_the_scenes_world(begin, room, draw_curves, score_often):
-    run = begin(max_steps=20, strategy="none")  # without margins, which the curve does not have
+    run = begin(max_steps=20)
     seeds_in_world = run.frame.points_to_world(gaussians_of(run.state.params).means)
     assert np.allclose(seeds_in_world, room.points.xyz, atol=1e-4)
     run.train()

@@ -143,6 +143,7 @@ class TrainingRun:
             scores = EvalResult(())
             if self._test_views:
                 scores = score(render, self._test_views, on_view=self._draw)
+                self._end_curve(scores, len(world))
             result = TrainingResult(
                 dataclasses.replace(scores, num_gaussians=len(world), model_bytes=world.num_bytes),
                 tuple(
@@ -168,6 +169,15 @@ class TrainingRun:
         if not has_margins(self.settings, views):
             return model
         return with_margins(model, self.frame, views, cap, self.trainer.device)
+
+    def _end_curve(self, scores: EvalResult, num_gaussians: int) -> None:
+        """Make the curve end with the scores of the model that has margins."""
+        records = self.state.records
+        ends = bool(records) and records[-1].step == self.state.step
+        if ends and has_margins(self.settings, self._train_views):
+            records[-1] = records[-1]._replace(
+                test_psnr=scores.psnr, test_ssim=scores.ssim, num_gaussians=num_gaussians
+            )
 
     def _draw(
         self, view: View, render: Float32[np.ndarray, "H W 3"], errors: Float32[np.ndarray, "H W"]
