@@ -1,0 +1,22 @@
+# All commands on a CPU, but for depth networks and Ray. From the folder that holds the scene:
+#   docker build -t splatseed SPLATSEED_FOLDER
+#   docker run --rm --user "$(id -u):$(id -g)" -v "$PWD:/work" splatseed upsample SCENE -o OUT
+FROM python:3.11-slim
+
+# OpenMP, for Numba's kernels.
+RUN apt-get update \
+    && apt-get install --yes --no-install-recommends libgomp1 \
+    && rm -rf /var/lib/apt/lists/*
+
+COPY pyproject.toml constraints.txt README.md LICENSE /source/
+COPY src /source/src
+RUN pip install --no-cache-dir --constraint /source/constraints.txt \
+        --extra-index-url https://download.pytorch.org/whl/cpu \
+        "/source[train,view,sfm,scan,exr,r3d]" \
+    && mkdir --mode 1777 /home/any
+
+# For any --user. Kernels are compiled at first use, into this home: mount a volume there to keep them.
+ENV HOME=/home/any USER=any
+WORKDIR /work
+ENTRYPOINT ["splatseed"]
+CMD ["--help"]
