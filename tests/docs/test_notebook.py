@@ -27,6 +27,7 @@ def test_it_is_a_notebook_without_results():
         assert not cell.get("outputs")
 
 
+@pytest.mark.slow
 def test_its_cells_run_in_order(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     first, *others = (
