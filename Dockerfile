@@ -13,10 +13,10 @@ COPY src /source/src
 RUN pip install --no-cache-dir --constraint /source/constraints.txt \
         --extra-index-url https://download.pytorch.org/whl/cpu \
         "/source[train,view,sfm,scan,exr,r3d]" \
-    && mkdir --mode 1777 /home/any
+    && mkdir --mode 1777 /cache
 
 # For any --user. Kernels are compiled at first use, into this home: mount a volume there to keep them.
-ENV HOME=/home/any USER=any
+ENV HOME=/cache USER=any
 WORKDIR /work
 ENTRYPOINT ["splatseed"]
 CMD ["--help"]
