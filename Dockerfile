@@ -10,8 +10,9 @@ RUN apt-get update \
 
 COPY pyproject.toml constraints.txt README.md LICENSE /source/
 COPY src /source/src
-RUN pip install --no-cache-dir --constraint /source/constraints.txt \
-        --extra-index-url https://download.pytorch.org/whl/cpu \
+# PyTorch's CPU build: its index stands in requirements.py.
+RUN index=$(sed -n 's/^_CPU_BUILDS = "\(.*\)"/\1/p' /source/src/splatseed/requirements.py) \
+    && pip install --no-cache-dir --constraint /source/constraints.txt --extra-index-url "$index" \
         "/source[train,view,sfm,scan,exr,r3d]" \
     && mkdir --mode 1777 /cache
 
