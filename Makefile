@@ -13,7 +13,7 @@ READY := $(VENV)/.ready
 # without it in 21.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo demo-points test quick coverage lint format bench clean
+.PHONY: demo demo-points test quick coverage lint format bench site clean
 .DEFAULT_GOAL := test
 
 $(BASE): pyproject.toml constraints.txt
@@ -70,5 +70,10 @@ bench: $(READY)
 	$(BIN)/python -m benchmarks.rendering.render
 	$(BIN)/python -m benchmarks.rendering.train_step
 
+# The pages of docs in the folder site.
+site: $(BASE)
+	@$(PIP) mkdocs-material
+	$(BIN)/python -m mkdocs build --strict
+
 clean:
-	rm -rf $(VENV) demo .mypy_cache .pytest_cache .ruff_cache .hypothesis .coverage
+	rm -rf $(VENV) demo site .mypy_cache .pytest_cache .ruff_cache .hypothesis .coverage

@@ -76,7 +76,7 @@ def _files(part):
 
 
 def test_what_errors_tell_to_install_is_what_the_package_asks_for():
-    project = tomllib.loads((SOURCE.parents[1] / "pyproject.toml").read_text("utf-8"))["project"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     extras = {
         extra: {each.partition(";")[0] for each in packages}
         for extra, packages in project["optional-dependencies"].items()
@@ -110,8 +110,7 @@ def test_what_to_install_is_for_this_python_and_for_the_whole_extra(monkeypatch,
 
 def test_nothing_is_to_be_installed_that_is_not_published():
     """An index has no splatseed yet, so its extras can be had from its own folder only."""
-    root = SOURCE.parents[1]
-    for path in (*root.glob("*.md"), *root.glob("docs/*.md"), *SOURCE.rglob("*.py")):
+    for path in (*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *SOURCE.rglob("*.py")):
         text = " ".join(path.read_text("utf-8").split())
         assert not re.search(r"pip install [\"']?splatseed", text), path
         if path.suffix == ".py":  # messages name this Python's own pip; docstrings need not

@@ -69,6 +69,7 @@ def test_the_demo_leaves_a_scene_scores_pictures_and_runs(tmp_path, splatseed):
     again = splatseed("evaluate", out / "run_poses")
     assert again.code == 0, again
     assert f"{metrics['poses']['psnr']:.2f}" in again.out
+    assert f"splatseed export {out / 'run_poses'} -o model.html" in run.out
 
 
 def test_without_pytorch_the_demo_does_not_train(splatseed, tmp_path, monkeypatch):
@@ -77,10 +78,13 @@ def test_without_pytorch_the_demo_does_not_train(splatseed, tmp_path, monkeypatc
 
     monkeypatch.setattr(demo, "require", absent)
     monkeypatch.setattr(demo, "methods_for", lambda _: ("auto", "linear"))
-    run = splatseed("demo", "--views", 4, "-o", tmp_path / "demo")
+    run = splatseed("demo", "--views", 4, "--train-steps", 9, "-o", tmp_path / "demo")
     assert run.code == 0, run
     assert "not trained: no torch installed" in run.err
     assert "splatseed evaluate" not in run.out
+    rest = f"splatseed demo -o {tmp_path / 'demo'} --training only --train-steps 9"
+    assert rest in run.out
+    assert "splatseed export" not in run.out
     assert not (tmp_path / "demo" / "run_sfm").exists()
     assert (tmp_path / "demo" / "geometry.csv").is_file()
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import splatseed
 
 SOURCE = Path(splatseed.__file__).parent
-TEXT = (Path(__file__).parents[2] / "docs" / "architecture.md").read_text("utf-8")
+ROOT = Path(__file__).parents[2]
+TEXT = (ROOT / "docs" / "architecture.md").read_text("utf-8")
 PATH = re.compile(
     r"`((?:[a-z_0-9]+/)+[a-z_0-9]+\.py)(?:: ([\w.]+))?`((?:,? (?:and )?`[A-Za-z_]\w*`)*)"
 )
@@ -21,7 +22,7 @@ def test_named_files_hold_the_named_functions():
     for path, name, others in found:
         file = SOURCE / path
         if not file.is_file():  # of the repository, such as a test
-            file = SOURCE.parents[1] / path
+            file = ROOT / path
         text = file.read_text("utf-8")
         names = [name, *re.findall(r"`(\w+)`", others)] if name else []
         for each in (part for full in names if full for part in full.split(".")):

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import doctest
 import re
+import runpy
 import shlex
 from contextlib import suppress
 from functools import cache
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -132,3 +134,12 @@ def test_docstrings_examples_give_what_they_say(name):
     result = doctest.testmod(import_module(name), optionflags=doctest.ELLIPSIS)
     assert result.attempted
     assert result.failed == 0
+
+
+def test_the_site_keeps_links_among_its_pages_and_no_others():
+    """As does mkdocs, which need not be installed."""
+    change = runpy.run_path(str(ROOT / "docs" / "site_links.py"))["on_page_markdown"]
+    page = SimpleNamespace(file=SimpleNamespace(src_uri="results/gpu.md"))
+    inside = "[a](../training.md#cpu-or-cuda), [b\nc](README.md), [d](https://d.e), [f](#g)"
+    outside = " ![h](../pictures/h.png) [i](../../benchmarks/README.md#j) [k](../../examples)"
+    assert change(inside + outside, page=page) == f"{inside} ![h](../pictures/h.png) i k"

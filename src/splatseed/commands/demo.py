@@ -119,9 +119,17 @@ def run(arguments: list[str]) -> None:
         trained = _train(options) if options.train_steps else False
     another = f"splatseed upsample {quoted(out / 'scene')} --method spline --ratio 16 -o OUT"
     longer = f"splatseed train {quoted(out / f'scene_{SHOWN}')} --max-steps 3000 -o RUN"
-    score = ("the scores again", f"splatseed evaluate {quoted(out / f'run_{POSES}')}")
     commands = [("another method", another), ("a longer run", longer)]
-    print_next([*commands, *([score] if trained else [])])
+    if trained:
+        model = quoted(out / f"run_{POSES}")
+        commands += [("the scores again", f"splatseed evaluate {model}")]
+        commands += [("a page with the model", f"splatseed export {model} -o model.html")]
+    elif options.train_steps:
+        steps = f" --train-steps {options.train_steps}"
+        same = steps if options.train_steps != Options.train_steps else ""
+        rest = f"splatseed demo -o {quoted(out)} --training only{same}"
+        commands.insert(0, ("training, once its packages are installed", rest))
+    print_next(commands)
 
 
 def _upsample_by(name: str, scene: Scene, ratio: float = RATIO) -> PointCloud:
