@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, Int64
 from scipy.ndimage import median_filter
 
 from splatseed.depth.stereo._kernels.semiglobal import (
@@ -27,8 +27,10 @@ from splatseed.depth.stereo._kernels.semiglobal import (
     place,
 )
 from splatseed.depth.stereo.matching import DepthPrior, grey_image, other_from_view
+from splatseed.photos.sources import elsewhere
 from splatseed.photos.view import View
 from splatseed.progress import Progress, in_threads, num_threads
+from splatseed.projection import camera_centers
 from splatseed.runtime.memory import check_memory
 
 DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
@@ -119,6 +121,18 @@ def _depth(
     return np.asarray(median_filter(depth, chosen.median))
 
 
+def _nearest(cam_from_world: Float64[np.ndarray, "V 4 4"], i: int) -> Int64[np.ndarray, " K"]:
+    """Return the views at other places than view i, the nearest first.
+
+    Of several at a place, as the parts of a panorama, the first is that which looks most alike.
+    """
+    centers, axes = camera_centers(cam_from_world), cam_from_world[:, 2, :3]
+    gap = np.linalg.norm(centers[:, None] - centers, axis=2)
+    others = elsewhere(gap, i)
+    distance = np.round(gap[i, others] / gap.max(), 9)
+    return others[np.lexsort([-(axes @ axes[i])[others], distance])]
+
+
 def _costs(
     i: int,
     views: Sequence[View],
@@ -128,8 +142,7 @@ def _costs(
 ) -> Float32[np.ndarray, "H W D"]:
     """Return the cost of each hypothesis at each pixel of view i."""
     chosen, shape = SEMIGLOBAL, greys[i].shape
-    distances = [np.linalg.norm(o.camera.center - views[i].camera.center) for o in views]
-    others = [j for j in np.argsort(distances, kind="stable") if j != i][: chosen.num_sources]
+    others = _nearest(np.stack([view.cam_from_world for view in views]), i)[: chosen.num_sources]
     warps = [np.ascontiguousarray(other_from_view(views[i], views[j])) for j in others]
     sampled, sums = np.empty(shape, np.float32), np.empty((5, shape[1]))
     each = np.empty((len(others), *shape), np.float32)
