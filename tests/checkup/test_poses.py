@@ -88,11 +88,17 @@ def test_poses_at_which_nothing_can_be_compared_are_refused(spoil, error, found,
         check_poses(scene, scene.images)
 
 
+def test_of_few_photographs_too_little_overlap_is_named_as_a_reason(room, poses):
+    scene = _posed(room, np.random.default_rng(0).permutation(poses))
+    with pytest.raises(SceneFormatError, match="show too little in common"):
+        check_poses(scene, scene.images)
+
+
 def test_only_poses_of_scenes_without_points_are_checked(room, poses, monkeypatch):
     notes = []
     seeds = upsample(_posed(room, poses), note=notes.append)
     assert len(seeds) > 300
-    assert len(notes) == 1
+    assert [note.kind for note in notes] == ["confirmed-depth", "few-photographs"]
     monkeypatch.setattr(module, "check_poses", None)
     upsample(room, "stereo")
     with pytest.raises(SceneNotFoundError, match=r"other than test views.*all 1 are test views"):
