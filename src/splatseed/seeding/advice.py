@@ -197,8 +197,10 @@ def untrainable(scene: Scene) -> Finding | None:
 def _why_untrainable(scene: Scene) -> str:
     if not scene.images:
         return "Points alone cannot be trained: training needs photographs and cameras."
+    if len(scene.images) < 2:
+        return "Training needs at least two photographs."
     if not all(scene.split()):
-        return "Training needs at least two photographs, one to train on and one to test."
+        return "Training needs photographs of both lists: to train on and to test."
     folder = scene.source.image_dir
     if folder is None:
         return "Training needs the photographs: put them beside the model in a folder named images."
