@@ -66,7 +66,7 @@ def semiglobal_depths(
     Args:
         views: The photographs, pinhole.
         xyz: Points of the scene, in the frame of the views' poses; each view's search extends a
-            little beyond those in front of it.
+            little beyond those that it sees or nearly sees.
         progress: Called with the stage and the fraction done.
 
     Raises:
@@ -93,9 +93,16 @@ def semiglobal_depths(
 
 
 def _hypotheses(view: View, xyz: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarray, " D"]:
+    """Return the inverse depths to try, by the points within a frame's size of a view's frame.
+
+    Points farther aside lie at any depth, down to 0; without others, their distances count.
+    """
     uv, depth = view.camera.project(xyz)
-    front = depth > 0
-    low, high = DepthPrior.from_points(uv[front], 1.0 / depth[front]).bounds
+    size = np.array([view.width, view.height])
+    near = (depth > 0) & ((uv >= -size) & (uv < 2 * size)).all(axis=1)
+    if not near.any():
+        near[:], depth = True, np.linalg.norm(xyz - view.camera.center, axis=1)
+    low, high = DepthPrior.from_points(uv[near], 1.0 / depth[near]).bounds
     return np.linspace(low, high, SEMIGLOBAL.num_hypotheses)
 
 
