@@ -88,6 +88,12 @@ def test_poses_at_which_nothing_can_be_compared_are_refused(spoil, error, found,
         check_poses(scene, scene.images)
 
 
+def test_of_few_photographs_too_little_overlap_is_named_as_a_reason(room, poses):
+    scene = _posed(room, np.random.default_rng(0).permutation(poses))
+    with pytest.raises(SceneFormatError, match="show too little in common"):
+        check_poses(scene, scene.images)
+
+
 def test_only_poses_of_scenes_without_points_are_checked(room, poses, monkeypatch):
     notes = []
     seeds = upsample(_posed(room, poses), note=notes.append)

@@ -103,6 +103,13 @@ def test_ordinary_scenes_are_not_moved(room, rng):
     assert not choose_origin(clip, in_order=True).any()
 
 
+def test_cameras_in_one_place_but_for_rounding_are_not_moved(rng):
+    for far in (1.2, 1500.0):
+        places = far * (1 + rng.integers(-2, 3, (6, 3)) * 2.0**-52)
+        assert not choose_origin(places, in_order=True).any()
+    assert choose_origin(places + UTM).any()
+
+
 def test_few_cameras_elsewhere_do_not_choose_the_origin(rng):
     for scale in (1.0, 1e-3, 1e3):  # of the unit of length
         walk = scale * (np.arange(40)[:, None] * [0.1, 0, 0] + np.array(UTM))

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from splatseed.camera import Intrinsics
-from splatseed.errors import SplatseedError
+from splatseed.errors import SceneFormatError, SplatseedError
+from splatseed.io import load_scene
 from splatseed.io.camera_records import brown
 from splatseed.io.load import is_scene
 from splatseed.io.photogrammetry import _R8, _without_r8, find_photographs, with_r8
@@ -27,7 +28,7 @@ from . import (
     test_realityscan as realityscan,
     test_rtabmap as rtabmap,
 )
-from .exports import load, made_cameras, write_photographs
+from .exports import SIZE, load, made_cameras, write_photographs
 
 VALUES = ("nan", "-inf", "1e400", "-1", "0", "null", "[]", '""', "{}", "\ufffd", "x")
 
@@ -115,6 +116,31 @@ def test_gaussians_are_no_points(tmp_path):
     assert not len(load(tmp_path).points)
     write_ply(tmp_path / "b.ply", PointCloud(made.xyz, made.rgb.astype(np.uint8)))
     assert load(tmp_path).source.points_path == tmp_path / "b.ply"
+
+
+def test_spherical_cameras_are_panoramas_of_their_size(tmp_path):
+    made = made_cameras()
+    folders = [tmp_path / program for program in ("metashape", "opensfm", "openmvg")]
+    for folder, names in zip(folders, (metashape.NAMES, opensfm.NAMES, openmvg.NAMES), strict=True):
+        write_photographs(folder / "images", names)
+    size = f'<resolution width="{SIZE[0]}" height="{SIZE[1]}"/>'
+    whole = f'<sensor id="0" label="360" type="spherical">{size}</sensor>'
+    metashape.write(folders[0], made, [whole], metashape.NAMES)
+    opensfm.write(folders[1] / "reconstruction.json", made, [{"projection_type": "spherical"}])
+    views = openmvg.scene_of(made, posed=4)
+    for each in views["intrinsics"]:
+        data = {"width": SIZE[0], "height": SIZE[1]}
+        each["value"] = {"polymorphic_name": "spherical", "ptr_wrapper": {"id": 9, "data": data}}
+    (folders[2] / "sfm_data.json").write_text(json.dumps(views))
+    for folder in folders:
+        read = load_scene(folder, require_points=False, panoramas=True)
+        assert len(read.images) == 4
+        for image, rotation in zip(read.images, made.rotations, strict=True):
+            assert image.intrinsics.model == "EQUIRECTANGULAR"
+            assert image.intrinsics.params == SIZE == (image.lens.width, image.lens.height)
+            np.testing.assert_allclose(image.camera.cam_from_world[:3, :3], rotation, atol=1e-9)
+        with pytest.raises(SceneFormatError, match="splatseed undistort"):
+            load(folder)
 
 
 def write_each(root):

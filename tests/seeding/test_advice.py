@@ -10,7 +10,7 @@ import pytest
 from splatseed.camera import Intrinsics
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene
-from splatseed.seeding.advice import AS_IT_IS, Measured, advise, measure
+from splatseed.seeding.advice import AS_IT_IS, Measured, advise, measure, untrainable
 from splatseed.training.traits import STRATEGIES
 
 FERN = Measured(6_009, 120_000, empty=0.24)
@@ -52,6 +52,15 @@ def test_no_gain_of_other_captures_is_promised(measured, strategy):
 
 def test_scoring_may_ask_for_another_room():
     assert advise(FERN, max_seeds=6_500, room=1.0).method == "auto"
+
+
+def test_one_photograph_is_too_few_and_none_is_needed_to_test():
+    lens = Intrinsics(1, "PINHOLE", 40, 30, (30.0, 30, 20, 15))
+    images = tuple(
+        Image(f"{i}.png", i, lens, np.array([1.0, 0, 0, 0]), np.zeros(3)) for i in (1, 2)
+    )
+    assert untrainable(Scene(PointCloud.empty(), images[:1])).text.endswith("two photographs.")
+    assert "two photographs" not in untrainable(Scene(PointCloud.empty(), images)).text
 
 
 ANGLES = np.linspace(0, 2 * np.pi, 8, endpoint=False)

@@ -64,6 +64,8 @@ class _Settings:
     low: float = 0.15
     """Agreement below which few points are to be expected: bare rooms and corridors have 0.08 and
     0.09, seven other captures 0.26 and more."""
+    few: int = 12
+    """Photographs up to which too little overlap is as likely a reason as wrong poses."""
     overlap_samples: int = 24
     """Photographs that are tested for overlap with all others."""
 
@@ -151,6 +153,8 @@ def _disagreement(
     inexact = error is not None and not error.exact
     found = f"a depth that others confirm at {agreement:.1%} of their pixels"
     new_poses = f"or estimate new poses: {sfm}."
+    if len(images) <= POSE_CHECK.few:
+        new_poses += " Few photographs may also show too little in common: take more in between."
     if inexact:
         found += f"; they miss each other by about {error}"
         fix = f"Correct the poses with `refine_poses=True`, {new_poses}"

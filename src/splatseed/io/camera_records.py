@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Float64
 
-from splatseed.camera import MODELS, Intrinsics, quat_from_rotation, rotation_from_quat
+from splatseed.camera import MODELS, PANORAMA, Intrinsics, quat_from_rotation, rotation_from_quat
 from splatseed.errors import SceneFormatError
 from splatseed.findings import Finding
 from splatseed.io.files import COPY_AGAIN
@@ -90,6 +90,11 @@ def fisheye(
     if any(tangential):
         return "THIN_PRISM_FISHEYE", (*focal, *center, k1, k2, *tangential, k3, k4, 0.0, 0.0)
     return "OPENCV_FISHEYE", (*focal, *center, k1, k2, k3, k4)
+
+
+def panorama(width: float, height: float) -> Lens:
+    """Return COLMAP's model of a panorama of all directions, whose parameters are its size."""
+    return PANORAMA.name, (float(width), float(height))
 
 
 def check_pose(pose: Sequence[float], of: str, where: str) -> None:

@@ -23,10 +23,9 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from jaxtyping import Float64
 
-from splatseed.camera import PANORAMA
 from splatseed.errors import SceneFormatError
 from splatseed.findings import Finding
-from splatseed.io.camera_records import Lens, brown, fisheye, format_error
+from splatseed.io.camera_records import Lens, brown, fisheye, format_error, panorama
 from splatseed.io.files import read_bytes, translate_errors
 from splatseed.io.photogrammetry import (
     EXPORT_AGAIN,
@@ -128,7 +127,7 @@ def _sensor(where: str, sensor: _Element) -> tuple[Size, Lens, list[Finding]]:
     width, height = (int(float(resolution.get(key) or 0)) for key in ("width", "height"))
     kind = calibration.get("type") or sensor.get("type") or "frame"
     if "spherical" in {kind, sensor.get("type")}:
-        return (width, height), (PANORAMA.name, (float(width), float(height))), []
+        return (width, height), panorama(width, height), []
     if kind != "frame" and kind not in _FISHEYES:
         raise SceneFormatError(
             f"a frame, fisheye or spherical type of sensor in {where}",

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from splatseed.camera import PANORAMA, Intrinsics
+from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError
 from splatseed.findings import Finding
 from splatseed.io.camera_records import (
@@ -32,6 +32,7 @@ from splatseed.io.camera_records import (
     check_enough,
     fisheye,
     make_intrinsics,
+    panorama,
     rigid_pose,
     unusable_findings,
 )
@@ -336,7 +337,8 @@ def _camera(
         with translate_errors(file, expected, fix=FIX), open_file(file) as opened:
             width, height = open_picture(opened).size
     if lens_model(values) in _PANORAMAS:  # programs differ in what they write as its focal length
-        return PANORAMA.name, width, height, (float(width), float(height))
+        model, params = panorama(width, height)
+        return model, width, height, params
     fl_x = _focal_length(where, values, "x", width, None)
     fl_y = _focal_length(where, values, "y", height, fl_x)
     center = _number(where, values, "cx", width / 2), _number(where, values, "cy", height / 2)

@@ -17,8 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from splatseed.camera import PANORAMA
-from splatseed.io.camera_records import Lens, brown, fisheye, format_error
+from splatseed.io.camera_records import Lens, brown, fisheye, format_error, panorama
 from splatseed.io.files import read_json, translate_errors
 from splatseed.io.photogrammetry import (
     EXPORT_AGAIN,
@@ -82,7 +81,7 @@ def _path(content: _Record, view: _Record) -> str:
 def _lens(where: str, data: _Record, size: Size) -> Lens:
     if "focal_length" not in data:
         if "value0" in data or len(data) == 2:
-            return PANORAMA.name, (float(size[0]), float(size[1]))
+            return panorama(*size)
         raise format_error("a focal_length", where, "none")
     f, (cx, cy) = float(data["focal_length"]), map(float, data["principal_point"])
     focal, center = (f, f), (cx, cy)

@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from splatseed.camera import PANORAMA, rotation_from_quat
+from splatseed.camera import rotation_from_quat
 from splatseed.errors import SceneFormatError
 from splatseed.findings import Finding
-from splatseed.io.camera_records import Lens, brown, fisheye, format_error
+from splatseed.io.camera_records import Lens, brown, fisheye, format_error, panorama
 from splatseed.io.files import read_json, translate_errors
 from splatseed.io.photogrammetry import EXPORT_AGAIN, Export, Shot, make_scene, points_of
 from splatseed.io.photograph_checks import Size
@@ -86,7 +86,7 @@ def _lens(where: str, camera: Mapping[str, Any], size: Size) -> Lens:
 
     side, kind = float(max(size)), camera.get("projection_type", "perspective")
     if kind in {"spherical", "equirectangular"}:
-        return PANORAMA.name, (float(size[0]), float(size[1]))
+        return panorama(*size)
     f = camera.get("focal_x", camera.get("focal"))
     if f is None:
         raise format_error("focal or focal_x", where, "neither")

@@ -42,6 +42,8 @@ class OriginLimits:
     """Smallest ratio of distances at which one frame is preferred over another."""
     single_point_extent: float = 1e3
     """Extent assumed for coincident positions, whose scale is unknown."""
+    rounding: float = 1e-14
+    """Extent, relative to a coordinate, up to which positions coincide."""
     distinct_frames: float = 5.0
     """Extents by which two frames must differ to be distinguished."""
     other_frame: float = 1e3
@@ -62,7 +64,9 @@ def choose_origin(
     if not len(known):
         return np.zeros(3)
     middle, extent = _middle(known)
-    far, extent = float(np.abs(middle).max()), extent or LIMITS.single_point_extent
+    far = float(np.abs(middle).max())
+    if extent <= LIMITS.rounding * far:  # in one place, as the parts of a panorama
+        extent = LIMITS.single_point_extent
     spacing = far * LIMITS.float32_step
     coarse = spacing > LIMITS.coarse * extent
     if in_order and len(known) > 1 and not coarse and far > LIMITS.min_gain * extent:

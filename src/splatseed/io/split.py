@@ -64,8 +64,9 @@ def _lists(scene: Scene) -> Iterator[tuple[str, list[list[str]]]]:
     ):
         parts = [_read(folder / name) if folder and name else [] for name in files]
         if any(parts):
-            there = (name for name, part in zip(files, parts, strict=True) if part)
-            yield " and ".join(there) + place, parts
+            there = [name for name, part in zip(files, parts, strict=True) if part]
+            first = f"{', '.join(there[:-1])} and " if there[1:] else ""
+            yield f"{first}{there[-1]}{place}", parts
 
 
 def _read(path: Path) -> list[str]:

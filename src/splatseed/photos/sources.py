@@ -63,9 +63,7 @@ def choose_by_pose(
     cosine = cam_from_world[:, 2, :3] @ cam_from_world[:, 2, :3].T
     chosen = np.full((len(centers), num), -1)
     for i in range(len(centers)):
-        apart = gap[i][gap[i] > ROUNDING * gap.max()]
-        # By the median, so that one camera far away does not make all others coincide.
-        other = np.flatnonzero(gap[i] > COINCIDENT * (np.median(apart) if len(apart) else np.inf))
+        other = elsewhere(gap, i)
         alike = other[cosine[i, other] > np.cos(np.radians(MAX_AXIS_ANGLE))]
         if len(alike) < num:
             alike = other[np.argsort(-cosine[i, other], kind="stable")[:num]]
@@ -74,6 +72,13 @@ def choose_by_pose(
         near = near[min(num // 2, len(near) - min(num, len(near))) :][:num]
         chosen[i, : len(near)] = near
     return chosen
+
+
+def elsewhere(gap: Float64[np.ndarray, "V V"], i: int) -> Int64[np.ndarray, " K"]:
+    """Return the views at another place than view i, given the distances of all."""
+    apart = gap[i][gap[i] > ROUNDING * gap.max()]
+    # By the median, so that one camera far away does not make all others coincide.
+    return np.flatnonzero(gap[i] > COINCIDENT * (np.median(apart) if len(apart) else np.inf))
 
 
 def views_of_points(

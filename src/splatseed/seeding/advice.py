@@ -198,7 +198,8 @@ def _why_untrainable(scene: Scene) -> str:
     if not scene.images:
         return "Points alone cannot be trained: training needs photographs and cameras."
     if not all(scene.split()):
-        return "Training needs at least two photographs, one to train on and one to test."
+        listed = "photographs to train on and to test in its lists"
+        return f"Training needs {listed if scene.listed else 'at least two photographs'}."
     folder = scene.source.image_dir
     if folder is None:
         return "Training needs the photographs: put them beside the model in a folder named images."

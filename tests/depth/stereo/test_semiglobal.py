@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from splatseed.camera import Camera
 from splatseed.depth.stereo._kernels.semiglobal import (
     BEHIND,
     IN_FRONT,
@@ -17,8 +18,10 @@ from splatseed.depth.stereo._kernels.semiglobal import (
     place,
 )
 from splatseed.depth.stereo.matching import other_from_view
-from splatseed.depth.stereo.semiglobal import semiglobal_depths
+from splatseed.depth.stereo.semiglobal import _hypotheses, _nearest, semiglobal_depths
 from splatseed.photos.loading import load_views
+from splatseed.photos.panorama import FACES
+from splatseed.photos.view import NO_PIXELS, View
 from splatseed.progress import silent
 
 from .made import arc, ball_before_wall, photograph, true_depth
@@ -102,6 +105,34 @@ def test_the_depth_of_the_smallest_cost_lies_between_hypotheses():
     out = np.empty((1, 1), np.float32)
     cheapest(total, w, out)
     assert 1 / out[0, 0] == pytest.approx(0.1 + 0.1 * 4.3, abs=1e-5)
+
+
+def test_views_of_the_same_place_are_not_compared_and_of_another_first_what_looks_alike():
+    poses = np.tile(np.eye(4), (12, 1, 1))
+    for k, (place_at, face) in enumerate((p, f) for p in (0.0, 0.7) for f in FACES.values()):
+        poses[k, :3, :3] = face
+        poses[k, :3, 3] = -face @ [1.2 + place_at, 1.5, 0.3]
+    for i in range(12):
+        others = _nearest(poses, i)
+        assert sorted(others) == [k for k in range(12) if (k < 6) != (i < 6)]
+        assert others[0] == (i + 6) % 12  # the same face
+
+
+def test_points_beside_a_camera_do_not_widen_its_range_of_depth():
+    pose = np.eye(4)
+    view = View(
+        "a", NO_PIXELS, Camera(np.array([[50.0, 0, 40], [0, 50, 30], [0, 0, 1]]), 80, 60, pose)
+    )
+    rng = np.random.default_rng(3)
+    seen = np.column_stack([rng.uniform(-1, 1, (50, 2)), rng.uniform(4, 5, 50)])
+    beside = np.column_stack([rng.uniform(5, 9, (50, 2)), rng.uniform(0.001, 0.1, 50)])
+    behind = seen * [1, 1, -1]
+    alone = _hypotheses(view, seen)
+    np.testing.assert_array_equal(_hypotheses(view, np.concatenate([seen, beside, behind])), alone)
+    assert 3 < 1 / alone[-1] < 4
+    assert 5 < 1 / alone[0] < 7
+    far = _hypotheses(view, behind)  # sees none: as far as they are
+    assert 3 < 1 / far[-1] < 1 / far[0] < 7
 
 
 def test_every_pixel_has_a_depth_and_what_one_view_sees_alone_lies_on_its_surface(tmp_path):

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, Int64
 from scipy.ndimage import median_filter
 
 from splatseed.depth.stereo._kernels.semiglobal import (
@@ -27,8 +27,10 @@ from splatseed.depth.stereo._kernels.semiglobal import (
     place,
 )
 from splatseed.depth.stereo.matching import DepthPrior, grey_image, other_from_view
+from splatseed.photos.sources import elsewhere
 from splatseed.photos.view import View
 from splatseed.progress import Progress, in_threads, num_threads
+from splatseed.projection import camera_centers
 from splatseed.runtime.memory import check_memory
 
 DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
@@ -64,7 +66,7 @@ def semiglobal_depths(
     Args:
         views: The photographs, pinhole.
         xyz: Points of the scene, in the frame of the views' poses; each view's search extends a
-            little beyond those in front of it.
+            little beyond those that it sees or nearly sees.
         progress: Called with the stage and the fraction done.
 
     Raises:
@@ -91,9 +93,16 @@ def semiglobal_depths(
 
 
 def _hypotheses(view: View, xyz: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarray, " D"]:
+    """Return the inverse depths to try, by the points within a frame's size of a view's frame.
+
+    Points farther aside lie at any depth, down to 0; without others, their distances count.
+    """
     uv, depth = view.camera.project(xyz)
-    front = depth > 0
-    low, high = DepthPrior.from_points(uv[front], 1.0 / depth[front]).bounds
+    size = np.array([view.width, view.height])
+    near = (depth > 0) & ((uv >= -size) & (uv < 2 * size)).all(axis=1)
+    if not near.any():
+        near[:], depth = True, np.linalg.norm(xyz - view.camera.center, axis=1)
+    low, high = DepthPrior.from_points(uv[near], 1.0 / depth[near]).bounds
     return np.linspace(low, high, SEMIGLOBAL.num_hypotheses)
 
 
@@ -119,6 +128,18 @@ def _depth(
     return np.asarray(median_filter(depth, chosen.median))
 
 
+def _nearest(cam_from_world: Float64[np.ndarray, "V 4 4"], i: int) -> Int64[np.ndarray, " K"]:
+    """Return the views at other places than view i, the nearest first.
+
+    Of several at a place, as the parts of a panorama, the first is that which looks most alike.
+    """
+    centers, axes = camera_centers(cam_from_world), cam_from_world[:, 2, :3]
+    gap = np.linalg.norm(centers[:, None] - centers, axis=2)
+    others = elsewhere(gap, i)
+    distance = np.round(gap[i, others] / gap.max(), 9)
+    return others[np.lexsort([-(axes @ axes[i])[others], distance])]
+
+
 def _costs(
     i: int,
     views: Sequence[View],
@@ -128,8 +149,7 @@ def _costs(
 ) -> Float32[np.ndarray, "H W D"]:
     """Return the cost of each hypothesis at each pixel of view i."""
     chosen, shape = SEMIGLOBAL, greys[i].shape
-    distances = [np.linalg.norm(o.camera.center - views[i].camera.center) for o in views]
-    others = [j for j in np.argsort(distances, kind="stable") if j != i][: chosen.num_sources]
+    others = _nearest(np.stack([view.cam_from_world for view in views]), i)[: chosen.num_sources]
     warps = [np.ascontiguousarray(other_from_view(views[i], views[j])) for j in others]
     sampled, sums = np.empty(shape, np.float32), np.empty((5, shape[1]))
     each = np.empty((len(others), *shape), np.float32)
