@@ -35,6 +35,9 @@ SHARE = 0.1
 """Maximum number of Gaussians of margins, as a fraction of the cap."""
 SIZE = 0.7  # standard deviation of a Gaussian, and its minimum distance from the frame, in steps
 OPACITY = 0.9
+FAR = 0.1
+"""Margins are at least as far as what this share of a view's pixels shows or lies beyond: nearer
+ones hang in the air, before what other cameras see."""
 
 
 def has_margins(settings: TrainSettings, views: Sequence[View]) -> bool:
@@ -110,7 +113,12 @@ def _continued(
     inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0)
     values = np.concatenate([color, inverse[..., None]], axis=2)
     values = np.pad(values, ((around, around), (around, around), (0, 0)))
-    return continued(values, known) if known.any() else values
+    if not known.any():
+        return values
+    far = np.quantile(values[known, 3], FAR)
+    filled = continued(values, known)
+    filled[..., 3] = np.where(known, filled[..., 3], np.minimum(filled[..., 3], far))
+    return filled
 
 
 def _width(shape: tuple[int, ...]) -> int:
