@@ -18,15 +18,8 @@ from jaxtyping import Float64
 
 from splatseed.errors import SceneNotFoundError
 from splatseed.io.camera_records import OPENCV_FROM_OPENGL, Lens, format_error
-from splatseed.io.files import IMAGE_SUFFIXES, is_data, numbered_lines, translate_errors
-from splatseed.io.photogrammetry import (
-    EXPORT_AGAIN,
-    Export,
-    Shot,
-    begins_with,
-    make_scene,
-    points_of,
-)
+from splatseed.io.files import IMAGE_SUFFIXES, is_data, numbered_lines
+from splatseed.io.photogrammetry import Export, Shot, begins_with, points_of, read_export
 from splatseed.io.photograph_checks import Size
 from splatseed.scene import OPENGL, Scene
 from splatseed.text import counted
@@ -44,9 +37,7 @@ def find_bundler(folder: Path) -> list[Path]:
 
 def read_bundler(path: Path, root: Path) -> Scene:
     """Read the cameras that have a pose, and the points."""
-    with translate_errors(path, "Bundler's cameras and points", fix=EXPORT_AGAIN):
-        export = _read(path)
-    return make_scene(export, root)
+    return read_export(_read, path, root, "Bundler's cameras and points")
 
 
 def _read(path: Path) -> Export:

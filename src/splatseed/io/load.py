@@ -77,7 +77,7 @@ class Reader(NamedTuple):
     read: Callable[[Path], Scene]
 
 
-class Export(NamedTuple):
+class ExportFormat(NamedTuple):
     """A format of one file of cameras, of which a folder may hold several."""
 
     files: str  # by which it is recognised, for messages
@@ -102,13 +102,13 @@ class Export(NamedTuple):
 
 
 EXPORTS = (
-    Export("Metashape's .xml", find_metashape, read_metashape),
-    Export("RealityScan's .csv", find_realityscan, read_realityscan),
-    Export("OpenSfM's reconstruction.json", find_opensfm, read_opensfm),
-    Export("Bundler's .out", find_bundler, read_bundler),
-    Export("OpenMVG's sfm_data.json", find_openmvg, read_openmvg),
-    Export("Meshroom's .sfm", find_meshroom, read_meshroom),
-    Export("RTAB-Map's _camera_poses.txt", find_rtabmap, read_rtabmap),
+    ExportFormat("Metashape's .xml", find_metashape, read_metashape),
+    ExportFormat("RealityScan's .csv", find_realityscan, read_realityscan),
+    ExportFormat("OpenSfM's reconstruction.json", find_opensfm, read_opensfm),
+    ExportFormat("Bundler's .out", find_bundler, read_bundler),
+    ExportFormat("OpenMVG's sfm_data.json", find_openmvg, read_openmvg),
+    ExportFormat("Meshroom's .sfm", find_meshroom, read_meshroom),
+    ExportFormat("RTAB-Map's _camera_poses.txt", find_rtabmap, read_rtabmap),
 )
 READERS = (
     Reader("poses_bounds.npy", is_llff, read_llff),

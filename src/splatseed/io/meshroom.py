@@ -28,15 +28,8 @@ from jaxtyping import Float64
 
 from splatseed.errors import SceneFormatError
 from splatseed.io.camera_records import Lens, brown, fisheye
-from splatseed.io.files import read_json, translate_errors
-from splatseed.io.photogrammetry import (
-    EXPORT_AGAIN,
-    Export,
-    Shot,
-    begins_with,
-    make_scene,
-    points_of,
-)
+from splatseed.io.files import read_json
+from splatseed.io.photogrammetry import Export, Shot, begins_with, points_of, read_export
 from splatseed.io.photograph_checks import Size
 from splatseed.scene import OPENCV, Scene
 
@@ -54,9 +47,7 @@ def find_meshroom(folder: Path) -> list[Path]:
 
 def read_meshroom(path: Path, root: Path) -> Scene:
     """Read the views that have a pose, and the points if there are any."""
-    with translate_errors(path, "Meshroom's SfMData, as JSON", fix=EXPORT_AGAIN):
-        export = _read(path)
-    return make_scene(export, root)
+    return read_export(_read, path, root, "Meshroom's SfMData, as JSON")
 
 
 def _read(path: Path) -> Export:

@@ -26,16 +26,8 @@ from jaxtyping import Float64
 from splatseed.errors import SceneFormatError
 from splatseed.findings import Finding
 from splatseed.io.camera_records import Lens, brown, fisheye, format_error, panorama
-from splatseed.io.files import read_bytes, translate_errors
-from splatseed.io.photogrammetry import (
-    EXPORT_AGAIN,
-    Export,
-    Shot,
-    begins_with,
-    ignored,
-    make_scene,
-    with_r8,
-)
+from splatseed.io.files import read_bytes
+from splatseed.io.photogrammetry import Export, Shot, begins_with, ignored, read_export, with_r8
 from splatseed.io.photograph_checks import Size
 from splatseed.scene import OPENCV, Scene
 from splatseed.similarity import Similarity, similarity_of
@@ -53,9 +45,7 @@ def find_metashape(folder: Path) -> list[Path]:
 
 def read_metashape(path: Path, root: Path) -> Scene:
     """Read the cameras that have a pose, and the points of a PLY file beside them."""
-    with translate_errors(path, "Metashape's cameras, as XML", fix=EXPORT_AGAIN):
-        export = _read(path)
-    return make_scene(export, root)
+    return read_export(_read, path, root, "Metashape's cameras, as XML")
 
 
 def _read(path: Path) -> Export:

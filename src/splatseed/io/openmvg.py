@@ -18,15 +18,8 @@ from typing import Any
 import numpy as np
 
 from splatseed.io.camera_records import Lens, brown, fisheye, format_error, panorama
-from splatseed.io.files import read_json, translate_errors
-from splatseed.io.photogrammetry import (
-    EXPORT_AGAIN,
-    Export,
-    Shot,
-    begins_with,
-    make_scene,
-    points_of,
-)
+from splatseed.io.files import read_json
+from splatseed.io.photogrammetry import Export, Shot, begins_with, points_of, read_export
 from splatseed.io.photograph_checks import Size
 from splatseed.scene import OPENCV, Scene
 
@@ -42,9 +35,7 @@ def find_openmvg(folder: Path) -> list[Path]:
 
 def read_openmvg(path: Path, root: Path) -> Scene:
     """Read the views that have a pose, and the points, which are grey."""
-    with translate_errors(path, "OpenMVG's scene, as JSON", fix=EXPORT_AGAIN):
-        export = _read(path)
-    return make_scene(export, root)
+    return read_export(_read, path, root, "OpenMVG's scene, as JSON")
 
 
 def _read(path: Path) -> Export:

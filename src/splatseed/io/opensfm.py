@@ -20,8 +20,8 @@ from splatseed.camera import rotation_from_quat
 from splatseed.errors import SceneFormatError
 from splatseed.findings import Finding
 from splatseed.io.camera_records import Lens, brown, fisheye, format_error, panorama
-from splatseed.io.files import read_json, translate_errors
-from splatseed.io.photogrammetry import EXPORT_AGAIN, Export, Shot, make_scene, points_of
+from splatseed.io.files import read_json
+from splatseed.io.photogrammetry import Export, Shot, points_of, read_export
 from splatseed.io.photograph_checks import Size
 from splatseed.scene import OPENCV, Scene
 from splatseed.text import counted
@@ -40,9 +40,7 @@ def find_opensfm(folder: Path) -> list[Path]:
 
 def read_opensfm(path: Path, root: Path) -> Scene:
     """Read the reconstruction with the most shots, and its points."""
-    with translate_errors(path, "OpenSfM's reconstructions, as JSON", fix=EXPORT_AGAIN):
-        export = _read(path)
-    return make_scene(export, root)
+    return read_export(_read, path, root, "OpenSfM's reconstructions, as JSON")
 
 
 def _read(path: Path) -> Export:

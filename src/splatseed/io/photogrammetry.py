@@ -8,7 +8,7 @@ another computer, or without suffix; they are searched for by name near the expo
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import NamedTuple
@@ -119,12 +119,12 @@ def _without_r8(where: str, lens: Lens, size: Size) -> tuple[Lens, float]:
     return ("FULL_OPENCV", tuple(map(float, params))), error
 
 
-def _approximated(count: int, error: float) -> list[Finding]:
-    if not count:
+def _approximated(errors: Sequence[float]) -> list[Finding]:
+    if not errors:
         return []
-    severity: Severity = "info" if error <= _MAX_ERROR else "warning"
-    text = f"The terms of r^8 of {counted(count, 'camera')}, which COLMAP's models lack, are"
-    text += f" approximated by FULL_OPENCV within {error:.2g} px."
+    severity: Severity = "info" if max(errors) <= _MAX_ERROR else "warning"
+    text = f"The terms of r^8 of {counted(len(errors), 'camera')}, which COLMAP's models lack, are"
+    text += f" approximated by FULL_OPENCV within {max(errors):.2g} px."
     return [Finding("approximated-distortion", text, severity)]
 
 
@@ -176,6 +176,13 @@ def largest(files: Sequence[Path]) -> tuple[Path, list[Finding]]:
     return first, [Finding("several-models", f"{text}: {names}.", fix="Pass a file to read it.")]
 
 
+def read_export(parse: Callable[[Path], Export], path: Path, root: Path, what: str) -> Scene:
+    """Read a file of cameras in a scene's folder; ``what`` it should be, for errors."""
+    with translate_errors(path, what, fix=EXPORT_AGAIN):
+        export = parse(path)
+    return make_scene(export, root)
+
+
 def make_scene(export: Export, root: Path) -> Scene:
     """Make the scene of an export in a folder.
 
@@ -198,30 +205,8 @@ def make_scene(export: Export, root: Path) -> Scene:
         folder, files, ambiguous = find_photographs(root, names)
     if folder and folder != root and folder.parent == root.absolute().parent:
         root = folder.parent  # the export lies in a folder beside the photographs
-    cameras: dict[tuple[Lens, Size], Intrinsics] = {}
-    images, unusable, lost = dict[str, Image](), dict[str, NotFiniteError](), list[str]()
-    errors = list[float]()  # of approximated lenses, px
-    for i, shot in enumerate(shots):
-        name = files.get(shot.name, "" if shot.name in ambiguous else _relative(shot.name))
-        if not name or name in images or (shot.size is None and shot.name not in files):
-            lost.append(shot.name)
-            continue
-        try:
-            size = shot.size or photograph_size(Path(folder or root, name))
-            with translate_errors(track, "a file of cameras", fix=EXPORT_AGAIN):
-                lens = shot.lens(size)
-            if (lens, size) not in cameras:
-                (model, params), error = _without_r8(shot.where, lens, size)
-                errors += [error] if model != lens[0] else []
-                camera_id = len(cameras) + 1
-                cameras[lens, size] = make_intrinsics(shot.where, camera_id, model, *size, params)
-            finite = bool(np.isfinite(shot.world_from_cam).all())
-            require_finite(finite, "a finite pose", shot.where, "NaN or infinity")
-            pose = rigid_pose(shot.where, shot.world_from_cam)
-        except NotFiniteError as error:
-            unusable[name] = error
-            continue
-        images[name] = Image(name, i + 1, cameras[lens, size], *pose)
+    used = _use_shots(export, Path(folder or root), files, ambiguous)
+    images, unusable, lost = used.images, used.unusable, used.lost
     if not images and lost:
         raise SceneNotFoundError(
             f"the photographs of {track} in {root} or its folder images, such as {lost[0]}",
@@ -232,7 +217,7 @@ def make_scene(export: Export, root: Path) -> Scene:
     points, found = _points(export, root)
     findings = (
         *export.findings,
-        *_approximated(len(errors), max(errors, default=0.0)),
+        *_approximated(used.errors),
         *_disabled(export.disabled),
         *left_out("missing-poses", "photograph", "a pose", export.unposed),
         *left_out("missing-photographs", "photograph", "one file of that name", lost),
@@ -248,10 +233,51 @@ def make_scene(export: Export, root: Path) -> Scene:
     )
     absent = (*unusable, *lost)
     scene = Scene(
-        cloud, tuple(images.values()), tuple(cameras.values()), None, source, findings,
+        cloud, tuple(images.values()), used.cameras, None, source, findings,
         absent=absent,
     )  # fmt: skip
     return recentered(scene, exact)
+
+
+class _Used(NamedTuple):
+    """The shots of an export that can be used, and why others cannot."""
+
+    images: dict[str, Image]
+    cameras: tuple[Intrinsics, ...]
+    unusable: dict[str, NotFiniteError]
+    lost: list[str]  # names without a photograph
+    errors: list[float]  # of approximated lenses, px
+
+
+def _use_shots(
+    export: Export, folder: Path, files: Mapping[str, str], ambiguous: Collection[str]
+) -> _Used:
+    """Make the images and cameras of shots, whose photographs are ``files`` of a folder."""
+    cameras: dict[tuple[Lens, Size], Intrinsics] = {}
+    images, unusable, lost = dict[str, Image](), dict[str, NotFiniteError](), list[str]()
+    errors = list[float]()  # of approximated lenses, px
+    for i, shot in enumerate(export.shots):
+        name = files.get(shot.name, "" if shot.name in ambiguous else _relative(shot.name))
+        if not name or name in images or (shot.size is None and shot.name not in files):
+            lost.append(shot.name)
+            continue
+        try:
+            size = shot.size or photograph_size(folder / name)
+            with translate_errors(export.track, "a file of cameras", fix=EXPORT_AGAIN):
+                lens = shot.lens(size)
+            if (lens, size) not in cameras:
+                (model, params), error = _without_r8(shot.where, lens, size)
+                errors += [error] if model != lens[0] else []
+                camera_id = len(cameras) + 1
+                cameras[lens, size] = make_intrinsics(shot.where, camera_id, model, *size, params)
+            finite = bool(np.isfinite(shot.world_from_cam).all())
+            require_finite(finite, "a finite pose", shot.where, "NaN or infinity")
+            pose = rigid_pose(shot.where, shot.world_from_cam)
+        except NotFiniteError as error:
+            unusable[name] = error
+            continue
+        images[name] = Image(name, i + 1, cameras[lens, size], *pose)
+    return _Used(images, tuple(cameras.values()), unusable, lost, errors)
 
 
 def _points(export: Export, root: Path) -> tuple[Points, list[Finding]]:

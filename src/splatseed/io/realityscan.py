@@ -20,8 +20,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.io.camera_records import OPENCV_FROM_OPENGL, Lens, brown, format_error
-from splatseed.io.files import numbered_lines, open_file, translate_errors
-from splatseed.io.photogrammetry import EXPORT_AGAIN, Export, Shot, make_scene, with_r8
+from splatseed.io.files import numbered_lines, open_file
+from splatseed.io.photogrammetry import Export, Shot, read_export, with_r8
 from splatseed.io.photograph_checks import Size
 from splatseed.scene import OPENGL, Scene
 
@@ -51,9 +51,7 @@ def _columns(line: str) -> list[str]:
 
 def read_realityscan(path: Path, root: Path) -> Scene:
     """Read the cameras, and the points of a PLY file beside them."""
-    with translate_errors(path, "RealityScan's camera parameters", fix=EXPORT_AGAIN):
-        export = _read(path)
-    return make_scene(export, root)
+    return read_export(_read, path, root, "RealityScan's camera parameters")
 
 
 def _read(path: Path) -> Export:
