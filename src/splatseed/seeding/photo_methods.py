@@ -236,8 +236,8 @@ class Auto(Stereo):
             from splatseed.seeding.few_photographs import pixel_seeds
 
             num = len(stereo.views)
-            text = f"Few photographs ({num}): a seed every two pixels, at a depth that semi-global "
-            note(Finding("few-photographs", f"{text}matching infers for all of them.", "info"))
+            text = f"Few photographs ({num}): semi-global matching gives every second pixel a seed."
+            note(Finding("few-photographs", text, "info"))
             return pixel_seeds(stereo.views, known.xyz.astype(np.float64), progress)
         if self._has_measured(scene):
             measured = self._from_maps(scene, stereo, known, progress, note)
