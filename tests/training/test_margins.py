@@ -10,7 +10,14 @@ from splatseed.photos.loading import load_views
 from splatseed.splat.from_seeds import initial_gaussians
 from splatseed.splat.rendering import ModelRenderer
 from splatseed.splat.training_frame import training_frame
-from splatseed.training.margins import MAX_PHOTOGRAPHS, SHARE, continued, has_margins, with_margins
+from splatseed.training.margins import (
+    MAX_PHOTOGRAPHS,
+    NEAR,
+    SHARE,
+    continued,
+    has_margins,
+    with_margins,
+)
 from splatseed.training.settings import TrainSettings
 
 
@@ -32,7 +39,7 @@ def test_a_view_beyond_the_frames_is_no_longer_black(room):
     views = load_views(room, room.images)[:3]
     model = initial_gaussians(room.points, opacity=0.9)
     frame = training_frame(views, room.points.xyz)
-    grown = with_margins(model, frame, views, None)
+    grown = with_margins(model, frame, views, 100 * len(model))
     added = len(grown) - len(model)
     assert added > 100
     assert (grown.means[: len(model)] == model.means).all()
@@ -54,6 +61,19 @@ def test_a_view_beyond_the_frames_is_no_longer_black(room):
     wide = [_wider(view) for view in views]
     before, after = (np.mean([black(each, view) for view in wide]) for each in (model, grown))
     assert after < 0.5 * before
+
+
+def test_no_margin_hides_what_another_camera_shows(room):
+    views = load_views(room, room.images)
+    model = initial_gaussians(room.points, opacity=0.9)
+    frame = training_frame(views, room.points.xyz)
+    added = with_margins(model, frame, views, 100 * len(model)).means[len(model) :]
+    assert len(added) > 100
+    for view in views:
+        depth = ModelRenderer(model, frame).depth(view)
+        distance = np.linalg.norm(added - view.camera.center, axis=1)
+        # The depths are those of a smaller frame: one in a hundred is leeway.
+        assert distance.min() > 0.99 * np.quantile(depth[depth > 0], NEAR)
 
 
 def _wider(view):

@@ -9,6 +9,7 @@ alone but for Gaussians that reach across its edge; the same model gives the sam
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -25,19 +26,23 @@ from splatseed.splat.rendering import ModelRenderer
 from splatseed.splat.training_frame import TrainingFrame
 from splatseed.training.settings import TrainSettings
 
-SIDE = 512
-"""Longer side, about, at which views are rendered, in pixels."""
+SIDE, MIN_SIDE = 512, 128
+"""Longer side, about, at which views are rendered, in pixels, and the shortest one."""
 WIDTH = 0.4
 """Width of the margin on each side, in longer sides of the frame."""
 STEP = 4
 """Minimum distance of Gaussians, in pixels of the rendered view."""
 SHARE = 0.1
 """Maximum number of Gaussians of margins, as a fraction of the cap."""
+CANDIDATES = 32  # at first, for each Gaussian that may stay: most lie within another frame
 SIZE = 0.7  # standard deviation of a Gaussian, and its minimum distance from the frame, in steps
 OPACITY = 0.9
 FAR = 0.1
 """Margins are at least as far as what this share of a view's pixels shows or lies beyond: nearer
 ones hang in the air, before what other cameras see."""
+NEAR = 0.1
+"""Nor is a Gaussian nearer to a camera than what this share of that camera's pixels shows: to a
+camera beside that one, it would hide everything."""
 
 
 def has_margins(settings: TrainSettings, views: Sequence[View]) -> bool:
@@ -66,19 +71,22 @@ def with_margins(
 ) -> Gaussians:
     """Add the margins of the training views to a model; both are in the scene's frame.
 
-    With a ``cap`` on the number of Gaussians, the faintest make room if they have to.
+    They are at most ``SHARE`` of the ``cap``, or of the model without one; with one the faintest
+    Gaussians make room if they have to.
     """
+    limit = SHARE * (len(model) if cap is None else cap)
+    side, step = _resolution(views, limit)
     renderer = ModelRenderer(model, frame, device)
-    small = [_reduced(view) for view in views]
+    small = [_reduced(view, side) for view in views]
     depths = [renderer.depth(view) for view in small]
     values = [_continued(renderer.color(v), d) for v, d in zip(small, depths, strict=True)]
-    limit, step = np.inf if cap is None else SHARE * cap, STEP
+    near = [float(np.quantile(d[d > 0], NEAR)) if (d > 0).any() else 0.0 for d in depths]
     while True:
-        parts = [_margin(i, small, values[i], step) for i in range(len(small))]
+        parts = [_margin(i, small, near, values[i], step) for i in range(len(small))]
         xyz, colors, sizes = (np.concatenate(each) for each in zip(*parts, strict=True))
         if len(xyz) <= limit:
             break
-        step += 1
+        step += max(1, step // 8)
     if cap is not None and len(model) + len(xyz) > cap:
         order = np.argsort(-model.opacities, kind="stable")[: cap - len(xyz)]
         model = model.select(np.sort(order))
@@ -97,8 +105,22 @@ def with_margins(
     return Gaussians(**grown, antialiased=model.antialiased)
 
 
-def _reduced(view: View) -> View:
-    factor = max(1, round(max(view.width, view.height) / SIDE))
+def _resolution(views: Sequence[View], limit: float) -> tuple[int, int]:
+    """Return the side at which views are rendered, and the first distance of Gaussians.
+
+    Of many views with a low limit only a few Gaussians each remain, for which small ones do.
+    """
+    pixels = sum(
+        SIDE**2 * (r + 2 * WIDTH) * (1 + 2 * WIDTH)
+        for r in (min(v.width, v.height) / max(v.width, v.height) for v in views)
+    )
+    step = max(STEP, round(math.sqrt(pixels / (CANDIDATES * limit))))
+    factor = min(step // STEP, SIDE // MIN_SIDE)
+    return SIDE // factor, round(step / factor)
+
+
+def _reduced(view: View, side: int) -> View:
+    factor = max(1, round(max(view.width, view.height) / side))
     width, height = view.width // factor, view.height // factor
     camera = Camera(scaled(view.K, 1 / factor), width, height, view.cam_from_world)
     return View(view.name, NO_PIXELS, camera, near=view.near)
@@ -126,7 +148,11 @@ def _width(shape: tuple[int, ...]) -> int:
 
 
 def _margin(
-    i: int, views: Sequence[View], values: Float64[np.ndarray, "h w 4"], step: int
+    i: int,
+    views: Sequence[View],
+    near: Sequence[float],
+    values: Float64[np.ndarray, "h w 4"],
+    step: int,
 ) -> tuple[Float64[np.ndarray, "M 3"], Float64[np.ndarray, "M 3"], Float64[np.ndarray, " M"]]:
     """Return positions, colours and sizes of the Gaussians beyond the frame of view i."""
     camera = views[i].camera
@@ -140,6 +166,8 @@ def _margin(
     uv, z, beyond = uv[used], 1.0 / inverse[used], beyond[used]
     xyz = camera.unproject(uv, z)
     kept = _unseen(xyz, i, views, beyond)
+    for view, clearance in zip(views, near, strict=True):
+        kept &= np.linalg.norm(xyz - view.camera.center, axis=1) >= clearance
     return xyz[kept], colors[used][kept], SIZE * step * z[kept] / camera.K[0, 0]
 
 
