@@ -50,13 +50,13 @@ def common(tmp_path_factory) -> Path:
 @pytest.fixture
 def compare_once(request, monkeypatch, common):
     """Compares the same photographs once for all tests that use this, but for ``compare_anew``."""
-    from .compared_once import USERS, match_views
+    from .compared_once import USERS
 
     folder = common / "compared"
     folder.mkdir(exist_ok=True)
     if "compare_anew" not in request.fixturenames:
-        for module in USERS:
-            monkeypatch.setattr(module, "match_views", partial(match_views, folder))
+        for module, found in USERS:
+            monkeypatch.setattr(module, found.__name__, partial(found, folder))
 
 
 @pytest.fixture
@@ -230,6 +230,17 @@ def room_of(common) -> Callable[[int, int, int], Room]:
         return Room(capture, path)
 
     return make
+
+
+@pytest.fixture
+def rooms_are_small(room_of, monkeypatch):
+    """Demo, examples and notebook are given rooms of 96 x 72, made once for all tests."""
+
+    def make(seed=0, num_views=40, width=400, height=300):
+        assert seed == 0
+        return room_of(num_views, min(width, 96), min(height, 72)).capture
+
+    monkeypatch.setattr("splatseed.synthetic.make_capture", make)
 
 
 @pytest.fixture(scope="session")
