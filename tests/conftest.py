@@ -131,7 +131,8 @@ def pytest_collection():
     Each process of the suite spends a third of its time to collect tests on it otherwise.
     """
     gc.disable()
-    _compile_own_part_first()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        _compile_own_part_first()
     found = yield
     gc.freeze()
     gc.enable()
@@ -145,8 +146,8 @@ def _compile_own_part_first() -> None:
     of that in a fresh clone.
     """
     rewriting = next(f for f in sys.meta_path if isinstance(f, AssertionRewritingHook))
-    count = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    own = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+    count = int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+    own = int(os.environ["PYTEST_XDIST_WORKER"].removeprefix("gw"))
     for path in sorted(Path(__file__).parent.rglob("test_*.py"))[own::count]:
         spec = rewriting.find_spec(path.stem, [str(path.parent)])
         module = importlib.util.module_from_spec(spec)
