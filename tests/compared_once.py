@@ -1,4 +1,4 @@
-"""Stereo and check-ups of the same captures, found once for all tests and processes of the suite.
+"""What photographs show, found once for all tests and processes of the suite: stereo and check-ups.
 
 Most tests of commands, runs and benchmarks look at one room, which takes seconds to compare, and
 half a second to hold against its points.
@@ -9,32 +9,37 @@ from __future__ import annotations
 import hashlib
 import pickle
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from splatseed.checkup import examination, pose_accuracy, poses, wrong_poses
-from splatseed.depth.stereo import coarse, matching, pipeline
+from splatseed.checkup import examination, focal_by_pairs, pose_accuracy, poses, wrong_poses
+from splatseed.depth.stereo import coarse, matching, pipeline, semiglobal
 from splatseed.depth.stereo.maps import StereoResult
 from splatseed.io.staging import atomic_file
 from splatseed.photos.view import View
+from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
+from splatseed.requirements import require
 from splatseed.scene import Image, Masks, Scene
-
-USERS = (coarse, pipeline, poses)
-"""The modules that compare photographs."""
+from splatseed.seeding import few_photographs
+from splatseed.sfm import triangulation
 
 CHECKS_OF_POSES = (
     (poses, "check_poses"),
     (examination, "check_poses"),
     (pose_accuracy, "estimate_pose_error"),
+    (focal_by_pairs, "estimate_focal_errors"),
 )
 CHECKS_OF_POINTS = (examination, "examine"), (wrong_poses, "find_wrong_poses")
-"""Functions of a scene, some of its images, the progress and others, as modules know them."""
+"""Functions of a scene, some of its images, settings and the progress, as modules know them."""
 
 _found: dict[bytes, Any] = {}
+_match_views = matching.match_views
+_semiglobal_depths, _triangulate = semiglobal.semiglobal_depths, triangulation.triangulate
 
 
 def match_views(
@@ -51,10 +56,10 @@ def match_views(
     Results are kept in ``folder`` for the other processes.
     """
     matching.check_stereo_memory(views, settings)
-    key = _digest(views, priors, sources, settings, seed)
+    key = _digest(views, "match_views", priors, sources, settings, seed)
 
     def match() -> StereoResult:
-        found = matching.match_views(views, priors, sources, settings, seed, progress)
+        found = _match_views(views, priors, sources, settings, seed, progress)
         return replace(found, views=())
 
     found, lists = _once(folder, key, match), ("planes", "costs", "agreeing")
@@ -63,19 +68,51 @@ def match_views(
     return replace(found, views=tuple(views), **copies)
 
 
+def semiglobal_depths(
+    folder: Path, views: Sequence[View], xyz: np.ndarray, progress: Progress
+) -> list[np.ndarray]:
+    """As ``semiglobal.semiglobal_depths``."""
+    semiglobal._check_memory(views)
+    key = _digest(views, "semiglobal_depths", xyz)
+    found = _once(folder, key, lambda: _semiglobal_depths(views, xyz, progress))
+    progress("compare depths", 1.0)
+    return [depth.copy() for depth in found]
+
+
+def triangulate(folder: Path, views: Sequence[View], progress: Progress = silent) -> PointCloud:
+    """As ``triangulation.triangulate``."""
+    require("pycolmap")
+    key = _digest(views, "triangulate")
+    found: PointCloud = _once(folder, key, lambda: _triangulate(views, progress))
+    progress("match features", 1.0)
+    return found
+
+
+USERS = (
+    *((module, match_views) for module in (coarse, pipeline, poses)),
+    (few_photographs, semiglobal_depths),
+    (triangulation, triangulate),
+)
+"""Modules that compare photographs, and what takes the place of their function of that name."""
+
+
 def checked_once(folder: Path, check: Callable[..., Any], *, of_points: bool) -> Callable[..., Any]:
     """Return a check of a scene that finds the same for all scenes of the same content.
 
     Errors are not kept, nor what names a scene's folder.
     """
 
-    def found(
-        scene: Scene, images: Sequence[Image], progress: Progress = silent, *others: Any
-    ) -> Any:
+    def found(scene: Scene, images: Sequence[Image], *others: Any) -> Any:
         if not all(image.has_photograph for image in images):
-            return check(scene, images, progress, *others)
-        key = _digest_of_scene(scene, images, check.__qualname__, others, of_points=of_points)
-        result = _once(folder, key, lambda: check(scene, images, progress, *others))
+            return check(scene, images, *others)
+        progress, settings = silent, []
+        for each in others:
+            if callable(each):
+                progress = each
+            else:
+                settings.append(each)
+        key = _digest_of_scene(scene, images, check.__qualname__, settings, of_points=of_points)
+        result = copy(_once(folder, key, lambda: check(scene, images, *others)))
         if scene.source.root and str(scene.source.root) in repr(result):
             del _found[key]
             (folder / key.hex()).unlink(missing_ok=True)
@@ -99,7 +136,7 @@ def _once(folder: Path, key: bytes, make: Callable[[], Any]) -> Any:
 def _digest(views: Sequence[View], *others: Any) -> bytes:
     content = hashlib.sha256(pickle.dumps(others))
     for view in views:
-        mask = b"" if view.mask is None else view.mask.tobytes()
+        mask = b"".join(part.tobytes() for part in (view.mask, view.empty) if part is not None)
         placed = view.K.tobytes() + view.cam_from_world.tobytes()
         shape = view.photograph.shape, view.name, view.near
         for each in (repr(shape).encode(), view.photograph.tobytes(), mask, placed):

@@ -50,13 +50,13 @@ def common(tmp_path_factory) -> Path:
 @pytest.fixture
 def compare_once(request, monkeypatch, common):
     """Compares the same photographs once for all tests that use this, but for ``compare_anew``."""
-    from .compared_once import USERS, match_views
+    from .compared_once import USERS
 
     folder = common / "compared"
     folder.mkdir(exist_ok=True)
     if "compare_anew" not in request.fixturenames:
-        for module in USERS:
-            monkeypatch.setattr(module, "match_views", partial(match_views, folder))
+        for module, found in USERS:
+            monkeypatch.setattr(module, found.__name__, partial(found, folder))
 
 
 @pytest.fixture
@@ -131,7 +131,8 @@ def pytest_collection():
     Each process of the suite spends a third of its time to collect tests on it otherwise.
     """
     gc.disable()
-    _compile_own_part_first()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        _compile_own_part_first()
     found = yield
     gc.freeze()
     gc.enable()
@@ -145,8 +146,8 @@ def _compile_own_part_first() -> None:
     of that in a fresh clone.
     """
     rewriting = next(f for f in sys.meta_path if isinstance(f, AssertionRewritingHook))
-    count = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    own = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+    count = int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+    own = int(os.environ["PYTEST_XDIST_WORKER"].removeprefix("gw"))
     for path in sorted(Path(__file__).parent.rglob("test_*.py"))[own::count]:
         spec = rewriting.find_spec(path.stem, [str(path.parent)])
         module = importlib.util.module_from_spec(spec)
@@ -230,6 +231,17 @@ def room_of(common) -> Callable[[int, int, int], Room]:
         return Room(capture, path)
 
     return make
+
+
+@pytest.fixture
+def rooms_are_small(room_of, monkeypatch):
+    """Demo, examples and notebook are given rooms of 96 x 72, made once for all tests."""
+
+    def make(seed=0, num_views=40, width=400, height=300):
+        assert seed == 0
+        return room_of(num_views, min(width, 96), min(height, 72)).capture
+
+    monkeypatch.setattr("splatseed.synthetic.make_capture", make)
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-from functools import partial
 
 import numpy as np
 import pycolmap
@@ -24,10 +23,8 @@ from splatseed.synthetic import write_capture
 
 
 @pytest.fixture(autouse=True)
-def quick(monkeypatch):
+def quick(rooms_are_small, monkeypatch):
     monkeypatch.setattr(demo, "RATIO", 2.0)
-    small = partial(synthetic.make_capture, width=96, height=72)
-    monkeypatch.setattr(synthetic, "make_capture", small)
 
 
 @pytest.mark.slow

@@ -31,9 +31,9 @@ def lines_of(out: str) -> list[list[str]]:
 
 
 @pytest.fixture
-def bent(room, tmp_path) -> Path:
-    """The room, its lens said to have distortion."""
-    scene = load_scene(room)
+def bent(room_of, tmp_path) -> Path:
+    """A small room, its lens said to have distortion."""
+    scene = load_scene(room_of(9, 64, 48).path)
     lens = scene.intrinsics[0]
     params = (*lens.params, 0.06, 0.0, 0.0, 0.0)
     lens = Intrinsics(lens.camera_id, "OPENCV", lens.width, lens.height, params)

@@ -42,6 +42,7 @@ def test_they_are_numbered_short_and_tested_here():
         assert f'"{path.name}"' in tests
 
 
+@pytest.mark.usefixtures("compare_once", "rooms_are_small")
 def test_upsample_a_scene(run, tmp_path):
     out = run("01_upsample_a_scene.py", "mine")
     before, after = (load_scene(tmp_path / name) for name in ("mine", "example_room_auto"))
@@ -87,6 +88,7 @@ def test_render_on_a_cpu(run, tmp_path):
         assert picture.size == (320, 120)
 
 
+@pytest.mark.usefixtures("rooms_are_small")
 def test_train_and_score(run, tmp_path):
     out = run("06_train_and_score.py", "example_room", 4)
     counts = [int(n.replace(",", "")) for n in re.findall(r"([\d,]+) Gaussians", out)]

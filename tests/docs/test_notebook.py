@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +15,8 @@ import pytest
 pytest.importorskip("gsplat", reason="training needs PyTorch and gsplat's strategies")
 
 from splatseed.io import load_scene
+
+from ..command_line import exit_code
 
 NOTEBOOK = json.loads((Path(__file__).parents[2] / "examples/colab.ipynb").read_text("utf-8"))
 SMALL = {"VIEWS": 12, "WIDTH": 96, "HEIGHT": 72, "MAX_STEPS": 20}
@@ -27,9 +33,20 @@ def test_it_is_a_notebook_without_results():
         assert not cell.get("outputs")
 
 
-@pytest.mark.slow
+def _run_here(words, **options):
+    """As ``subprocess.run`` does ``python -m splatseed ...``, without another import of PyTorch."""
+    assert words[:3] == [sys.executable, "-m", "splatseed"]
+    assert options == {"check": True, "capture_output": True, "text": True}
+    with redirect_stdout(StringIO()) as out:
+        code = exit_code(*words[3:])
+    assert code == 0
+    return subprocess.CompletedProcess(words, code, out.getvalue(), "")
+
+
+@pytest.mark.usefixtures("compare_once", "rooms_are_small")
 def test_its_cells_run_in_order(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(subprocess, "run", _run_here)
     first, *others = (
         "".join(cell["source"]) for cell in NOTEBOOK["cells"] if cell["cell_type"] == "code"
     )

@@ -25,6 +25,7 @@ def folder(room_of, tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.usefixtures("compare_once")
 @pytest.mark.parametrize("page", PAGES)
 def test_blocks_run(page, folder, capsys):
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text("utf-8"), re.DOTALL)

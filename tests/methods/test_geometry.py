@@ -120,7 +120,7 @@ def test_principal_axes_in_every_shape_of_a_neighbourhood(stretch, scale, rng):
     others = np.arange(1, 17)
     idx = np.zeros((850, 16), np.int32)
     idx[::17] = others + 17 * np.arange(50)[:, None]
-    frames, flat = local_frames(np.concatenate(clouds), idx)
+    frames, flat = local_frames(np.ascontiguousarray(np.concatenate(clouds)), idx)
     for points, frame, collinear in zip(clouds, frames[::17], flat[::17], strict=True):
         np.testing.assert_allclose(frame @ frame.T, np.eye(3), rtol=0, atol=1e-9)
         assert np.linalg.det(frame) > 0

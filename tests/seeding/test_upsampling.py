@@ -7,6 +7,7 @@ import pytest
 
 import splatseed as ss
 from splatseed.errors import ParameterError
+from splatseed.io import load_scene
 from splatseed.methods import SOURCE_CODES
 from splatseed.photos import loading
 from splatseed.pointcloud import PointCloud
@@ -63,8 +64,8 @@ def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads(
 
 
 @by_photographs
-def test_held_out_photographs_are_never_read(method, room, monkeypatch):
-    read, load = [], loading.load_photograph
+def test_held_out_photographs_are_never_read(method, room_path, monkeypatch):
+    room, read, load = load_scene(room_path), [], loading.load_photograph
     monkeypatch.setattr(
         loading,
         "load_photograph",

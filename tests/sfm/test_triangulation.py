@@ -88,6 +88,7 @@ def test_the_best_match_is_near_the_line_and_clearly_the_best():
     assert out.tolist() == [0, 1, -1, -1]
 
 
+@pytest.mark.usefixtures("compare_once")
 def test_auto_adds_them_where_there_are_no_points(bare, points, monkeypatch):
     def fail(*_):
         raise MissingDependencyError("pycolmap", found="none", fix="Get it")
@@ -107,6 +108,7 @@ def test_auto_adds_them_where_there_are_no_points(bare, points, monkeypatch):
     assert len(both) < len(stereo) + len(points)  # cover leaves their cells out
 
 
+@pytest.mark.usefixtures("compare_once")
 def test_auto_leaves_scenes_with_points_as_they_are(sixteen_views, monkeypatch):
     def fail(*_):
         raise AssertionError("not needed")

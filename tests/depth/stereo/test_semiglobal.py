@@ -82,8 +82,9 @@ def test_places_and_samples_on_a_plane(tmp_path):
     surface = np.full(grey.shape, z, np.float32)
     sampled, places = np.empty(shape, np.float32), np.empty(shape, np.uint8)
     for scale, where in ((1.0, SEEN), (0.5, BEHIND), (2.0, IN_FRONT)):
-        place(other_from_view(view, other), 1 / z, grey, surface * np.float32(scale), 0.2,
-              sampled, places)  # fmt: skip
+        there = surface * np.float32(scale)
+        warp, w = other_from_view(view, other), np.float32(1 / z)
+        place(warp, w, grey, there, 0.2, sampled, places)
         row, column = np.mgrid[: shape[0], : shape[1]]
         uv = np.stack([column.ravel(), row.ravel()], axis=1) + 0.5
         at, depth = other.camera.project(view.camera.unproject(uv, np.full(len(uv), z)))
@@ -100,7 +101,7 @@ def test_places_and_samples_on_a_plane(tmp_path):
 
 
 def test_the_depth_of_the_smallest_cost_lies_between_hypotheses():
-    w = np.linspace(0.1, 1.0, 10)
+    w = np.linspace(0.1, 1.0, 10, dtype=np.float32)
     total = ((np.arange(10) - 4.3) ** 2).astype(np.float32)[None, None]
     out = np.empty((1, 1), np.float32)
     cheapest(total, w, out)

@@ -92,7 +92,7 @@ def semiglobal_depths(
     return matched(first, "compare depths")
 
 
-def _hypotheses(view: View, xyz: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarray, " D"]:
+def _hypotheses(view: View, xyz: Float64[np.ndarray, "M 3"]) -> Float32[np.ndarray, " D"]:
     """Return the inverse depths to try, by the points within a frame's size of a view's frame.
 
     Points farther aside lie at any depth, down to 0; without others, their distances count.
@@ -103,14 +103,14 @@ def _hypotheses(view: View, xyz: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarr
     if not near.any():
         near[:], depth = True, np.linalg.norm(xyz - view.camera.center, axis=1)
     low, high = DepthPrior.from_points(uv[near], 1.0 / depth[near]).bounds
-    return np.linspace(low, high, SEMIGLOBAL.num_hypotheses)
+    return np.linspace(low, high, SEMIGLOBAL.num_hypotheses, dtype=np.float32)
 
 
 def _depth(
     i: int,
     views: Sequence[View],
     greys: Sequence[Float32[np.ndarray, "H W"]],
-    hypotheses: Float64[np.ndarray, " D"],
+    hypotheses: Float32[np.ndarray, " D"],
     maps: Sequence[Float32[np.ndarray, "H W"]],
 ) -> Float32[np.ndarray, "H W"]:
     """Return the map of view i, given the maps of the others, if there are any yet."""
@@ -144,7 +144,7 @@ def _costs(
     i: int,
     views: Sequence[View],
     greys: Sequence[Float32[np.ndarray, "H W"]],
-    hypotheses: Float64[np.ndarray, " D"],
+    hypotheses: Float32[np.ndarray, " D"],
     maps: Sequence[Float32[np.ndarray, "H W"]],
 ) -> Float32[np.ndarray, "H W D"]:
     """Return the cost of each hypothesis at each pixel of view i."""

@@ -32,7 +32,7 @@ def place(j_from_i, w, grey, depths, tolerance, sampled, places):
 
     Args:
         j_from_i: float64 [3, 4].
-        w: Inverse depth in the view.
+        w: Inverse depth in the view, float32.
         grey: The other photograph, float32 [h, w].
         depths: The other view's map, float32 [h, w]; empty if there is none.
         tolerance: Relative difference of depth within which a point is at the surface.
@@ -216,7 +216,7 @@ def cheapest(total, hypotheses, out):
 
     Args:
         total: float32 [H, W, D].
-        hypotheses: Inverse depths, float64 [D].
+        hypotheses: Inverse depths, float32 [D].
         out: Depth, float32 [H, W].
     """
     height, width, count = total.shape
