@@ -53,6 +53,7 @@ from splatseed.sfm.cameras import (
 )
 from splatseed.sfm.colmap import ColmapRun, Settings
 from splatseed.sfm.export import drop_repeats, export_scene
+from splatseed.sfm.gps import GpsFrame, GpsPosition, align_to_gps
 from splatseed.sfm.mapping import map_images
 from splatseed.sfm.matching import match_further, match_photographs
 from splatseed.sfm.panoramas import (
@@ -93,6 +94,7 @@ class SfmReport:
     refinement: Refinement | None = None  # None without ``refine_poses``
     poses: tuple[Image, ...] = ()  # the known poses, refined with ``refine_poses``
     num_pairs: int = 0  # matched pairs of photographs
+    gps: GpsFrame | None = None  # the frame, if it is that of GPS positions
     findings: tuple[Finding, ...] = ()  # a lens held, poses that may be wrong or were not refined
 
 
@@ -122,6 +124,9 @@ def reconstruct(
     note: Note = silent_note,
 ) -> SfmReport:
     """Reconstruct a scene: features, matching, mapping or triangulation, undistortion.
+
+    If EXIF has GPS positions that determine it, the frame is metric: x east, y north, z up. Else
+    frame and scale are arbitrary.
 
     Known poses and intrinsics stay exactly as given, and only points are estimated.
     ``refine_poses`` adjusts the poses to the matches, in the given world frame and scale, but not
@@ -181,6 +186,7 @@ def reconstruct(
         cameras = tuple(SharedCamera((name,), name, "") for name in others)
     with _staged(images, Path(output), "sfm", overwrite=overwrite) as staging:
         faces: dict[str, list[str]] = {}
+        places = {name: photo.gps for name, photo in photos.items() if photo.gps is not None}
         for finding in found:
             note(finding)
         if whole:
@@ -206,7 +212,8 @@ def reconstruct(
             features=[settings.max_image_size, settings.doubled, white],
             pairs=[settings.matcher, refine_poses, camera_model],
         )
-        options = camera_model, poses, refine_poses, test_names, masks, partial
+        gps = {faces.get(name, [name])[0]: place for name, place in places.items()}
+        options = camera_model, poses, refine_poses, test_names, masks, partial, gps
         work = resumable_work(Path(output), key, note, resume=resume)
         with work if keep or resume else nullcontext() as kept:
             how = (images, staging, settings, on_progress, kept, _reconstruct)
@@ -254,10 +261,13 @@ def _reconstruct(
     test_names: Collection[str],
     masks: Masks | None,
     partial: bool,
+    gps: Mapping[str, GpsPosition],
 ) -> SfmReport:
     refinement: Refinement | None = None
-    finding: Finding | None = None
+    frame: GpsFrame | None = None
     held: Finding | None = None
+    finding: Finding | None = None
+    located: Finding | None = None
     if poses is None:
         count = sum(len(camera.names) for camera in cameras)
         chosen, run = camera_model or default_model(count), replace(run, rigs=rigs)
@@ -269,6 +279,9 @@ def _reconstruct(
         agreement = match_photographs(run, model, masks)
         further = None if agreement is None else lambda lost: match_further(run, agreement, lost)
         model_dir, finding = map_images(run, names, chosen, further, partial=partial)
+        if gps:
+            aligned = run.work / "aligned"
+            model_dir, frame, located = align_to_gps(run.pycolmap, model_dir, aligned, gps)
     else:
         match_photographs(run, colmap.posed_model(run.pycolmap, poses), masks, poses)
         if refine_poses:
@@ -279,7 +292,8 @@ def _reconstruct(
     return replace(
         _report(run, staging, names),
         num_pairs=run.num_pairs(),
-        findings=tuple(each for each in (held, finding) if each is not None),
+        findings=tuple(each for each in (held, finding, located) if each is not None),
+        gps=frame,
         refinement=refinement,
         poses=tuple(poses or ()),
     )
