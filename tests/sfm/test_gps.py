@@ -157,7 +157,7 @@ def test_photographs_with_gps_give_a_metric_scene_with_north_and_up(room, tmp_pa
     near = np.linalg.norm(there[:, None] - room.points.xyz[None, ::7], axis=2).min(axis=1)
     assert np.median(near) < 0.2
     (finding,) = [each for each in report.findings if each.kind == "gps-frame"]
-    assert "by the GPS of 11 of 12 photographs" in finding.text
+    assert "By the GPS of 11 of 12 photographs" in finding.text
     assert f"{-frame.latitude:.6f} S, {frame.longitude:.6f} E" in finding.text
     assert finding.subjects == (names[3],)
     manifest = json.loads((report.path / "splatseed.json").read_text())

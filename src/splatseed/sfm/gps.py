@@ -160,11 +160,11 @@ def align_to_gps(
     longitude = (longitude + 180) % 360 - 180
     frame = GpsFrame(latitude, longitude, altitude, int(agrees.sum()), residual, turn)
     others = tuple(name for name, good in zip(names, agrees, strict=True) if not good)
+    number = counted(model.num_reg_frames(), "photograph")  # not of each panorama's six
     text = (
-        f"The scene is in metres, x east, y north and z up, by the GPS of {agrees.sum()} of "
-        f"{counted(len(posed), 'photograph')}. Its origin is at {frame.origin}. Cameras are "
-        f"{residual:.2g} m from their GPS positions (median), so that its axes are known to "
-        f"{turn:.2g} degrees."
+        f"By the GPS of {agrees.sum()} of {number}, the scene is in metres, x east, y north, z up. "
+        f"Its origin is at {frame.origin}. Cameras are {residual:.2g} m from their GPS positions "
+        f"(median), so that its axes are known to {turn:.2g} degrees."
     )
     if others:
         text += f" Not used are the positions of {name_some(others, 3)}, which contradict them."
