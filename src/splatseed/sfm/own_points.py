@@ -17,7 +17,7 @@ from splatseed.checkup.choices import UnfitPoints
 from splatseed.checkup.consistency import Evidence, Fit
 from splatseed.checkup.examination import EXAMINATION, UNFIT_POINTS, comparable, examine, fitting
 from splatseed.findings import Finding
-from splatseed.pointcloud import PointCloud
+from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Image, LeftOut, Scene
 
@@ -50,8 +50,8 @@ def _same_pose(a: Image, b: Image) -> bool:
 
 
 def points_without_tracks(scene: Scene) -> PointCloud:
-    """Return the distinct points that are not Structure-from-Motion's."""
-    without = scene.points.distinct
+    """Return the distinct originals that are not Structure-from-Motion's."""
+    without = scene.points.distinct & (scene.points.source == ORIGINAL)
     if scene.tracks is not None:
         without[: len(scene.tracks)] &= scene.tracks.lengths == 0
     return scene.points.select(without)

@@ -415,7 +415,7 @@ def refined(
         MissingDependencyError: pycolmap is absent.
     """
     require("pycolmap")
-    folder, own = photograph_folder(scene).absolute(), len(scene.points)
+    folder, own = photograph_folder(scene).absolute(), int(scene.points.distinct.sum())
     test = scene.split(test_every)[1]
     photos, _ = find_photos(folder)
     poses = match_poses(photos, scene, folder)

@@ -87,7 +87,7 @@ def _upsample(options: Options, methods: dict[str, Any], arguments: list[str]) -
         if options.gaussians is not None:  # photographs bound their sizes
             photo_methods.photographed(scene, without="leave out --gaussians")
         if options.refine_poses:
-            own = len(scene.points)
+            own = int(scene.points.distinct.sum())
             scene, kept, findings = _refined(options, scene, methods[options.method], note, clock)
             points_in = report.triangulated(own, kept, len(scene.points))
             notes += findings
