@@ -84,22 +84,22 @@ def read_gps(image: PilImage.Image) -> GpsPosition | None:
     """Read the GPS position of an opened image; None without one, or if it is void or damaged."""
     with suppress(Exception):  # Pillow raises any exception for truncated tags
         tags = image.getexif().get_ifd(_IFD)
-        angles = [_degrees(tags, _LATITUDE, "NS", 90), _degrees(tags, _LONGITUDE, "EW", 180)]
+        latitude = _degrees(tags, _LATITUDE, "NS", 90)
+        longitude = _degrees(tags, _LONGITUDE, "EW", 180)
         altitude, error = (float(tags.get(tag, math.nan)) for tag in (_ALTITUDE, _ERROR))
         below = tags.get(_ALTITUDE_REF, 0)
         if (below[0] if isinstance(below, bytes) else int(below)) % 2:  # 1; in EXIF 3.0 also 3
             altitude = -altitude
         void = str(tags.get(_STATUS, "")).startswith(_VOID)
-        if any(angles) and not void:  # some cameras write 0, 0 without a fix
-            return GpsPosition(*angles, altitude, error if error > 0 else math.nan)
+        if (latitude or longitude) and not void:  # some cameras write 0, 0 without a fix
+            return GpsPosition(latitude, longitude, altitude, error if error > 0 else math.nan)
     return None
 
 
 def _degrees(tags: Mapping[int, Any], reference: int, signs: str, limit: float) -> float:
     """Return an angle from degrees, minutes and seconds; raise an exception if there is none."""
     sign = 1 - 2 * signs.index(tags[reference][0].upper())
-    parts = tags[reference + 1]
-    angle = sum(float(part) / 60**i for i, part in enumerate(parts))
+    angle = sum((float(part) / 60**i for i, part in enumerate(tags[reference + 1])), 0.0)
     if not 0 <= angle <= limit:
         raise ValueError(angle)
     return sign * angle

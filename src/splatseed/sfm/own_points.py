@@ -10,16 +10,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from splatseed.checkup.choices import UnfitPoints
-from splatseed.checkup.consistency import Evidence, Fit
-from splatseed.checkup.examination import EXAMINATION, UNFIT_POINTS, comparable, examine, fitting
 from splatseed.findings import Finding
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Image, LeftOut, Scene
+
+if TYPE_CHECKING:  # Numba, for which --help would wait, comes with it
+    from splatseed.checkup.consistency import Fit
 
 _MOVED = "transformed-points"
 _LESS = 0.05
@@ -77,18 +79,23 @@ def points_kept(
             the scene lists.
         color: Gives colours to the points where they lack them.
     """
+    from splatseed.checkup import examination  # noqa: PLC0415  (as above)
+    from splatseed.checkup.consistency import Evidence  # noqa: PLC0415
+
     own = points_without_tracks(scene)
     if not len(own):
         return own, ()
     there = with_refined(scene, scene.replace(images=tuple(refined), points=own))
-    images = comparable(there, test_every)
+    images = examination.comparable(there, test_every)
+    if len(images) < 2:
+        return color(there).points, ()
     evidence = Evidence(there, images)
-    checkup = examine(there, images, progress, evidence)
-    fitted, findings = fitting(there, checkup, unfit_points)
-    kept = color(fitted).points if len(fitted.points) else fitted.points
-    if unfit := tuple(each for each in findings if each.kind in {UNFIT_POINTS, _MOVED}):
+    checkup = examination.examine(there, images, progress, evidence)
+    fitted, findings = examination.fitting(there, checkup, unfit_points)
+    kept = color(fitted).points
+    if unfit := tuple(each for each in findings if each.kind in {examination.UNFIT_POINTS, _MOVED}):
         return kept, unfit
-    if (after := checkup.fit) is None or after.tested < EXAMINATION.min_confirming:
+    if (after := checkup.fit) is None or after.tested < examination.EXAMINATION.min_confirming:
         return kept, ()
     given = {image.name: image.cam_from_world for image in scene.images}
     before = evidence.fit(
