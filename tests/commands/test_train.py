@@ -17,6 +17,7 @@ from splatseed.commands.train import bar_columns, parse
 from splatseed.console import LiteralConsole
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene, write_scene
+from splatseed.pointcloud import PointCloud
 from splatseed.sfm import Refinement, pipeline
 
 pytest.importorskip("torch", reason="training needs PyTorch")
@@ -199,9 +200,9 @@ def refinement_of_room(room, monkeypatch):
 def test_points_stay_where_refinement_gains_nothing(room, refinement_of_room, splatseed, tmp_path):
     refinement_of_room(kept=True)
     own, scene = load_scene(room), load_scene(room)
-    same, finding = pipeline.refined(own, 0)
+    same, number, (finding,) = pipeline.refined(own, 0)
     note = str(finding)
-    assert same is own
+    assert (same, number) == (own, len(own.points))
     words = ("--method", "linear", "--ratio", "2", "-o")
     out = splatseed("upsample", room, "--refine-poses", *words, tmp_path / "seeds").err
     assert "Poses and points stay as given" in note
@@ -230,6 +231,36 @@ def test_points_that_refinement_replaces_are_announced_first(
     out = splatseed("train", room, *SHORT, "--refine-poses", "-o", tmp_path / "run").err
     told = f"The scene's {number:,} points are replaced by 100 triangulated"
     assert told in out.split("->")[0]
+
+
+def test_points_of_a_scan_stay_in_a_resumed_run_too(
+    room, as_by_a_device, monkeypatch, splatseed, tmp_path
+):
+    truth, run = load_scene(room), tmp_path / "run"
+    near = PointCloud(truth.points.xyz[:100] + 0.001, truth.points.rgb[:100])
+    found = pipeline._Refined(truth.images, near, Refinement(False, 9.0, 0.5))
+    monkeypatch.setattr(pipeline, "_call", lambda *_: found)
+    scanned = as_by_a_device(truth)
+    images = tuple(replace(image, observations=None) for image in scanned.images)
+    write_scene(scanned.replace(images=images, points=truth.points), tmp_path / "scanned")
+    words = (*SHORT, "--seeds", "scene", "--refine-poses", "-o", run)
+    out = splatseed("train", tmp_path / "scanned", *words)
+    assert (out.code, out.unexpected) == (0, "")
+    number = len(truth.points)
+    assert f"The scene's {number:,} points stay, beside 100 triangulated" in out.err
+    assert "of the scene's own points at the refined poses" in out.err
+    np.testing.assert_array_equal(load_scene(run / "scene").points.xyz[:number], truth.points.xyz)
+    assert json.loads((run / "config.json").read_text())["seeds"]["count"] == number + 100
+    finished = _gaussians(run)
+    _unfinish(run)
+    assert splatseed("train", tmp_path / "scanned", "--resume", "-o", run).code == 0
+    assert _gaussians(run) == finished
+    words = ("--refine-poses", "--method", "linear", "--ratio", "2", "-o", tmp_path / "seeds")
+    out = splatseed("upsample", tmp_path / "scanned", *words)
+    assert f"{number + 100:,} points, 100 of them triangulated" in out.err.split("->")[0]
+    np.testing.assert_array_equal(
+        load_scene(tmp_path / "seeds").points.xyz[:number], truth.points.xyz
+    )
 
 
 def test_refine_poses_is_refused_on_a_resumed_run_and_on_seeds(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from dataclasses import replace
 from functools import partial
@@ -12,14 +13,17 @@ from PIL import Image as PilImage
 from scipy.spatial.transform import Rotation
 
 from splatseed.camera import quat_from_rotation
+from splatseed.checkup.examination import examine
 from splatseed.errors import ReconstructionError
 from splatseed.io import load_scene
-from splatseed.progress import silent
-from splatseed.scene import LeftOut
-from splatseed.sfm import Settings, first_look, matching, reconstruct
+from splatseed.pointcloud import PointCloud
+from splatseed.progress import silent, silent_note
+from splatseed.scene import LeftOut, Tracks
+from splatseed.seeding.clouds.point_colors import with_colors
+from splatseed.sfm import Settings, first_look, matching, reconstruct, with_refined
 from splatseed.sfm.colmap import ColmapRun, posed_model, require_pycolmap
 from splatseed.sfm.matching import match_photographs
-from splatseed.sfm.pipeline import _Refined, refined as refined_scene, with_refined
+from splatseed.sfm.pipeline import _Refined, refined as refined_scene
 from splatseed.sfm.refinement import (
     Poses,
     Refinement,
@@ -177,11 +181,77 @@ def test_poses_that_stay_among_refined_ones_are_named(room, tmp_path, monkeypatc
         return _Refined(arguments[6], room.points, change)
 
     monkeypatch.setattr("splatseed.sfm.pipeline._call", call)
-    _, note = refined_scene(scene, 0)
+    note = refined_scene(scene, 0).findings[0]
     assert str(note).endswith(
         "The poses of 2 of 12 images stay as given: SfM does not read view_001.webp; fewer than 10 "
         "points are seen in view_000.png."
     )
+
+
+@pytest.fixture
+def refined_to(monkeypatch):
+    """Refines a scene to given images, with ten triangulated points, in place of pycolmap."""
+
+    def refine_to(scene, images, **options):
+        made = PointCloud(np.arange(30.0).reshape(10, 3) / 1000, np.full((10, 3), 7, np.uint8))
+        found = _Refined(tuple(images), made, Refinement(False, 9.0, 0.1))
+        monkeypatch.setattr("splatseed.sfm.pipeline._call", lambda *_: found)
+        result = refined_scene(scene, 0, **options)
+        assert result.scene.images[2].translation is images[2].translation
+        np.testing.assert_array_equal(result.scene.points.xyz[result.num_kept :], made.xyz)
+        return result
+
+    return refine_to
+
+
+def test_points_that_were_not_triangulated_stay(room, refined_to):
+    noisy = with_noise(room.images, 2.0, 3.0)
+    own = room.points.select(slice(None))
+    scanned = room.replace(images=tuple(noisy), points=own, tracks=None)
+    scene, number, (note, fit) = refined_to(scanned, room.images)
+    assert number == len(own)
+    np.testing.assert_array_equal(scene.points.xyz[:number], own.xyz)
+    np.testing.assert_array_equal(scene.points.rgb[:number], own.rgb)
+    assert f"The scene's {number:,} points stay, beside 10 triangulated" in note.text
+    better, worse = (int(share) for share in re.findall(r"(\d+)% (?:of|at)", fit.text))
+    right = examine(room.replace(points=own, tracks=None), room.images).fit
+    assert (fit.severity, better) == ("info", round(100 * right.confirmed))
+    assert better > worse + 20
+    # Poses that fit the points less than the given ones do, if not as badly
+    near = with_noise(room.images, 0.6, 0.6)
+    scene, _, (_, fit) = refined_to(scanned.replace(images=room.images), near)
+    assert (fit.severity, "refine_poses=False" in fit.fix) == ("warning", True)
+    # Some of them with tracks
+    ids, features = np.full(20, 1, np.uint32), np.arange(20, dtype=np.uint32)
+    xyz, once = own.xyz[:20].astype(np.float64), np.arange(21)
+    few = Tracks(np.arange(20), xyz, np.ones(20), once, ids, features)
+    scene, number, (note, _) = refined_to(scanned.replace(tracks=few), room.images)
+    assert number == len(own) - 20
+    np.testing.assert_array_equal(scene.points.xyz[:number], own.xyz[20:])
+    assert f"20 of the scene's {len(own):,} points are replaced by 10" in note.text
+
+
+def test_points_that_photographs_contradict_are_replaced(room, refined_to):
+    noisy, rng = with_noise(room.images, 2.0, 3.0), np.random.default_rng(0)
+    xyz = rng.uniform(room.points.xyz.min(axis=0), room.points.xyz.max(axis=0), (3000, 3))
+    random = PointCloud(xyz, rng.integers(0, 256, (3000, 3), np.uint8))
+    scanned = room.replace(images=tuple(noisy), points=random, tracks=None)
+    _, number, (note, unfit) = refined_to(scanned, room.images)
+    assert (number, unfit.kind) == (0, "points-do-not-fit")
+    assert "The scene's 3,000 points are replaced by 10" in note.text
+    scene, number, _ = refined_to(scanned, room.images, unfit_points="keep")
+    assert number == 3000
+    np.testing.assert_array_equal(scene.points.xyz[:number], random.xyz)
+
+
+def test_colours_are_those_at_refined_poses(room, refined_to):
+    grey = room.points.replace(rgb=np.full((len(room.points), 3), 128, np.uint8))
+    noisy = with_noise(room.images, 2.0, 3.0)
+    scanned = room.replace(images=tuple(noisy), points=grey, tracks=None)
+    color = partial(with_colors, test_every=0, note=silent_note, progress=silent)
+    scene, number, _ = refined_to(scanned, room.images, color=color)
+    off = np.abs(scene.points.rgb[:number].astype(int) - room.points.rgb).mean(axis=1)
+    assert np.median(off) < 10
 
 
 def test_points_of_the_files_that_were_left_out_go_with_the_others(room):

@@ -288,7 +288,13 @@ def with_fitting_points(
             found=repr(unfit_points),
             fix="Try drop, the default.",
         )
-    checkup = examine(scene, comparable(scene, test_every), progress)
+    return fitting(scene, examine(scene, comparable(scene, test_every), progress), unfit_points)
+
+
+def fitting(
+    scene: Scene, checkup: CheckUp, unfit_points: UnfitPoints
+) -> tuple[Scene, tuple[Finding, ...]]:
+    """Leave out, move or keep points that do not fit by an examination; also return findings."""
     if checkup.points != "unfit" or unfit_points == "keep":
         return scene, checkup.findings
     if unfit_points == "move" and (affine := checkup.scene_from_points) is not None:

@@ -54,9 +54,10 @@ class Options:
     distances are used. No features are detected where masks (in a folder masks beside the
     photographs) are 0."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """The scene folder to write."""
+    """The scene folder to write: in metres, with x east, y north and z up, if GPS in the
+    photographs' EXIF determines that."""
     poses_from: Path | None = None
-    """Triangulate points for the poses and intrinsics of this scene."""
+    """Triangulate points, in place of its own, for the poses and intrinsics of this scene."""
     refine_poses: bool = False
     """Refine the poses of --poses-from first, such as those of a phone or SLAM, which are off by a
     degree or two."""

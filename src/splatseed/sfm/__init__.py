@@ -12,14 +12,17 @@ or 4047 points. With ``threads=1`` the output is bit-identical. On a GPU nothing
 """
 
 from splatseed.sfm.colmap import MatcherName, Settings
-from splatseed.sfm.pipeline import SfmReport, reconstruct, refined, undistort, with_refined
+from splatseed.sfm.own_points import points_without_tracks, with_refined
+from splatseed.sfm.pipeline import RefinedScene, SfmReport, reconstruct, refined, undistort
 from splatseed.sfm.refinement import Refinement
 
 __all__ = [
     "MatcherName",
+    "RefinedScene",
     "Refinement",
     "Settings",
     "SfmReport",
+    "points_without_tracks",
     "reconstruct",
     "refined",
     "undistort",

@@ -22,6 +22,7 @@ from typing import NamedTuple, TypeAlias
 from PIL import Image as PilImage
 
 from splatseed.findings import Finding
+from splatseed.sfm.gps import GpsPosition
 from splatseed.text import agreeing, counted, name_some
 
 Size = tuple[int, int]
@@ -61,11 +62,12 @@ class Exif(NamedTuple):
 
 
 class Photo(NamedTuple):
-    """The properties of a photograph by which cameras are grouped."""
+    """The properties of a photograph; cameras are grouped by size and EXIF."""
 
     size: Size
     exif: Exif = Exif()
     digest: str = ""  # of the file's bytes
+    gps: GpsPosition | None = None
 
 
 Photos: TypeAlias = Mapping[str, Photo]

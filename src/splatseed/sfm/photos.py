@@ -47,6 +47,7 @@ from splatseed.progress import Progress, silent
 from splatseed.runtime.fingerprint import fingerprint
 from splatseed.scene import Image, Scene
 from splatseed.sfm.cameras import Photo, Photos, read_exif
+from splatseed.sfm.gps import read_gps
 from splatseed.text import name_some, quoted
 
 COPIES = "readable"
@@ -163,11 +164,11 @@ def _read(path: Path) -> tuple[Photo | None, bool]:
     """Decode an image; return the photograph (None for depth maps), and if it has colour."""
     encoded = photograph_bytes(path)
     with open_photograph(path, encoded) as image:
-        mode, exif = image.mode, read_exif(image)
+        mode, exif, gps = image.mode, read_exif(image), read_gps(image)
     if mode.startswith(_DEPTH_MODES):
         return None, False
     digest = fingerprint(encoded)
-    return Photo(check_photograph(path), exif, digest), mode not in _GREY_MODES
+    return Photo(check_photograph(path), exif, digest, gps), mode not in _GREY_MODES
 
 
 def match_poses(photos: Photos, scene: Scene, image_dir: Path) -> tuple[Image, ...]:

@@ -20,6 +20,7 @@ import numpy as np
 
 from splatseed import errors
 from splatseed.camera import CAMERA_MODELS, Intrinsics
+from splatseed.checkup.choices import UnfitPoints
 from splatseed.findings import Finding
 from splatseed.io import write_scene
 from splatseed.io.colmap_layout import write_lists, write_split
@@ -39,7 +40,7 @@ from splatseed.pointcloud import PointCloud
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.requirements import require, version_of
 from splatseed.runtime.child import Child
-from splatseed.scene import Image, LeftOut, Masks, Scene
+from splatseed.scene import Image, Masks, Scene
 from splatseed.sfm import colmap
 from splatseed.sfm.cameras import (
     MIN_DISTORTION,
@@ -53,8 +54,10 @@ from splatseed.sfm.cameras import (
 )
 from splatseed.sfm.colmap import ColmapRun, Settings
 from splatseed.sfm.export import drop_repeats, export_scene
+from splatseed.sfm.gps import GpsFrame, GpsPosition, align_to_gps
 from splatseed.sfm.mapping import map_images
 from splatseed.sfm.matching import match_further, match_photographs
+from splatseed.sfm.own_points import points_kept, with_refined
 from splatseed.sfm.panoramas import (
     PanoramaRig,
     PanoramasName,
@@ -93,6 +96,7 @@ class SfmReport:
     refinement: Refinement | None = None  # None without ``refine_poses``
     poses: tuple[Image, ...] = ()  # the known poses, refined with ``refine_poses``
     num_pairs: int = 0  # matched pairs of photographs
+    gps: GpsFrame | None = None  # the frame, if it is that of GPS positions
     findings: tuple[Finding, ...] = ()  # a lens held, poses that may be wrong or were not refined
 
 
@@ -122,6 +126,9 @@ def reconstruct(
     note: Note = silent_note,
 ) -> SfmReport:
     """Reconstruct a scene: features, matching, mapping or triangulation, undistortion.
+
+    If EXIF has GPS positions that determine it, the frame is metric: x east, y north, z up. Else
+    frame and scale are arbitrary.
 
     Known poses and intrinsics stay exactly as given, and only points are estimated.
     ``refine_poses`` adjusts the poses to the matches, in the given world frame and scale, but not
@@ -181,6 +188,7 @@ def reconstruct(
         cameras = tuple(SharedCamera((name,), name, "") for name in others)
     with _staged(images, Path(output), "sfm", overwrite=overwrite) as staging:
         faces: dict[str, list[str]] = {}
+        places = {name: photo.gps for name, photo in photos.items() if photo.gps is not None}
         for finding in found:
             note(finding)
         if whole:
@@ -206,7 +214,8 @@ def reconstruct(
             features=[settings.max_image_size, settings.doubled, white],
             pairs=[settings.matcher, refine_poses, camera_model],
         )
-        options = camera_model, poses, refine_poses, test_names, masks, partial
+        gps = {faces.get(name, [name])[0]: place for name, place in places.items()}
+        options = camera_model, poses, refine_poses, test_names, masks, partial, gps
         work = resumable_work(Path(output), key, note, resume=resume)
         with work if keep or resume else nullcontext() as kept:
             how = (images, staging, settings, on_progress, kept, _reconstruct)
@@ -254,10 +263,13 @@ def _reconstruct(
     test_names: Collection[str],
     masks: Masks | None,
     partial: bool,
+    gps: Mapping[str, GpsPosition],
 ) -> SfmReport:
     refinement: Refinement | None = None
-    finding: Finding | None = None
+    frame: GpsFrame | None = None
     held: Finding | None = None
+    finding: Finding | None = None
+    located: Finding | None = None
     if poses is None:
         count = sum(len(camera.names) for camera in cameras)
         chosen, run = camera_model or default_model(count), replace(run, rigs=rigs)
@@ -269,6 +281,9 @@ def _reconstruct(
         agreement = match_photographs(run, model, masks)
         further = None if agreement is None else lambda lost: match_further(run, agreement, lost)
         model_dir, finding = map_images(run, names, chosen, further, partial=partial)
+        if gps:
+            aligned = run.work / "aligned"
+            model_dir, frame, located = align_to_gps(run.pycolmap, model_dir, aligned, gps)
     else:
         match_photographs(run, colmap.posed_model(run.pycolmap, poses), masks, poses)
         if refine_poses:
@@ -279,7 +294,8 @@ def _reconstruct(
     return replace(
         _report(run, staging, names),
         num_pairs=run.num_pairs(),
-        findings=tuple(each for each in (held, finding) if each is not None),
+        findings=tuple(each for each in (held, finding, located) if each is not None),
+        gps=frame,
         refinement=refinement,
         poses=tuple(poses or ()),
     )
@@ -355,15 +371,43 @@ def _undistort(
     return _report(run, staging, names)
 
 
+class RefinedScene(NamedTuple):
+    """A scene at refined poses."""
+
+    scene: Scene
+    num_kept: int  # points of its own that stay, the first; the others were triangulated
+    findings: tuple[Finding, ...]
+
+
+def _unchanged(scene: Scene) -> Scene:
+    return scene
+
+
 def refined(
-    scene: Scene, seed: int, progress: Progress = silent, *, test_every: int = 0
-) -> tuple[Scene, Finding]:
+    scene: Scene,
+    seed: int,
+    progress: Progress = silent,
+    *,
+    test_every: int = 0,
+    unfit_points: UnfitPoints = "drop",
+    color: Callable[[Scene], Scene] = _unchanged,
+) -> RefinedScene:
     """Return the scene at refined poses, and what was done.
 
     Where refinement gains nothing, the scene keeps its poses, and its points if it has any. Else
-    points are triangulated from its photographs' features, in place of its own. Photographs, lenses
+    points are triangulated from its photographs' features. They replace those with tracks, which
+    were triangulated at the given poses; others (LiDAR, a mesh) come first and stay, as refined
+    poses are in the given frame, if photographs do not contradict them there. Photographs, lenses
     and depth maps stay. The test views, every ``test_every``-th (0: none) or those of the scene's
     list, are refined with the others, but contribute no triangulated point.
+
+    Args:
+        scene: The scene.
+        seed: The seed of RANSAC and bundle adjustment.
+        progress: Called with the stage and the fraction done.
+        test_every: How often a photograph is a test view.
+        unfit_points: What to do with its own points if photographs contradict them.
+        color: Gives colours to its own points at refined poses where they lack them.
 
     Raises:
         SceneNotFoundError: It has no photographs.
@@ -371,7 +415,7 @@ def refined(
         MissingDependencyError: pycolmap is absent.
     """
     require("pycolmap")
-    folder, own = photograph_folder(scene).absolute(), len(scene.points)
+    folder, own = photograph_folder(scene).absolute(), int(scene.points.distinct.sum())
     test = scene.split(test_every)[1]
     photos, _ = find_photos(folder)
     poses = match_poses(photos, scene, folder)
@@ -381,24 +425,36 @@ def refined(
         settings = _for_poses(Settings(seed=seed), photos)
         child = (folder, Path(name), settings, progress, None, _refine)
         found: _Refined = _call(*child, poses, names, scene.masks, own > 0)
-    change, count = found.refinement, f"{len(found.points):,}"
+    change, kept, count = found.refinement, scene.points, f"{len(found.points):,}"
+    fits: tuple[Finding, ...] = ()
     if change.kept:
         what = "Poses and points stay" if own else f"{count} points were triangulated; poses stay"
         how = f"{what} as given: refined poses gain less than 0.1 px of reprojection error."
     else:
-        what = f"The scene's {own:,} points are replaced by {count}" if own else f"{count} points"
+        kept, fits = points_kept(
+            scene, found.poses, unfit_points, progress, test_every=test_every, color=color
+        )
         how = (
-            f"{what} triangulated at refined poses, which lower the mean reprojection error from "
-            f"{change.error_before:.2f} to {change.error_after:.2f} px: cameras turned by "
-            f"{change.median_turn:.2f} degrees and moved by {change.median_shift:.3g} units, both "
-            "the median."
+            f"{_what_stays(own, len(kept))}{count} triangulated at refined poses, which lower the "
+            f"mean reprojection error from {change.error_before:.2f} to {change.error_after:.2f} "
+            f"px: cameras turned by {change.median_turn:.2f} degrees and moved by "
+            f"{change.median_shift:.3g} units, both the median."
         )
         others = {image.name for image in scene.images} - {image.name for image in poses}
         unread = [name for name in sorted(others) if (folder / name).is_file()]
         if unrefined := unrefined_finding(len(scene.images), change.excluded, unread):
             how = f"{how} {unrefined}"
-    scene = with_refined(scene, scene.replace(images=found.poses, points=found.points))
-    return scene, Finding("refined-poses", how, "info")
+    points = PointCloud.concatenate(kept, found.points)  # if poses stay, the scene is returned
+    scene = with_refined(scene, scene.replace(images=found.poses, points=points))
+    return RefinedScene(scene, len(kept), (Finding("refined-poses", how, "info"), *fits))
+
+
+def _what_stays(own: int, kept: int) -> str:
+    """Begin a sentence that goes on with a number of triangulated points."""
+    if kept == own:
+        return f"The scene's {own:,} points stay, beside " if own else "There are "
+    which = f"{own - kept:,} of the scene's {own:,}" if kept else f"The scene's {own:,}"
+    return f"{which} points are replaced by "
 
 
 _LARGE = 1600  # px; longer sides of photographs whose features suffice without doubling
@@ -442,29 +498,6 @@ def _refine(
     xyz = np.array([point.xyz for point in points], np.float32)
     cloud = PointCloud(xyz, np.array([point.color for point in points], np.uint8))
     return _Refined(tuple(poses), cloud.select(cloud.distinct), refinement)
-
-
-def with_refined(scene: Scene, found: Scene) -> Scene:
-    """Replace poses and points by those of another scene of the same photographs.
-
-    Images missing there keep their poses; its points become originals without tracks. A scene with
-    points stays as it is if all poses are equal.
-    """
-    posed = {image.name: image for image in found.images}
-    pairs = [(image, posed.get(image.name, image)) for image in scene.images]
-    if len(scene.points) and all(_same_pose(image, pose) for image, pose in pairs):
-        return scene
-    images = tuple(
-        # Drop observations of the replaced points.
-        replace(i, quat=pose.quat, translation=pose.translation, observations=None)
-        for i, pose in pairs
-    )
-    points = PointCloud(found.points.xyz, found.points.rgb)
-    return scene.replace(images=images, points=points, tracks=None, left_out=LeftOut())
-
-
-def _same_pose(a: Image, b: Image) -> bool:
-    return np.array_equal(a.quat, b.quat) and np.array_equal(a.translation, b.translation)
 
 
 @contextmanager

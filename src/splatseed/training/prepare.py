@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.seeding.clouds.point_colors import with_colors
+from splatseed.sfm import points_without_tracks, refined, with_refined
 from splatseed.splat._kernels import WINDOW
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.training_frame import TrainingFrame, frame_of_model
@@ -111,8 +113,10 @@ def prepare_run(
     scene = _photographed(scene)  # before the folder is checked, which may be a bare cloud's
     scene, setup = _set_up(scene, Path(output), settings, options, named, note, progress)
     settings, folder = setup.settings, setup.folder
-    posed = _at_refined_poses(scene, setup) if setup.refine_poses else scene
-    triangulated = posed.points is not scene.points  # else refinement keeps them
+    posed, triangulated = scene, False
+    if setup.refine_poses:
+        posed = _at_refined_poses(scene, setup)
+        triangulated = posed is not scene and not len(points_without_tracks(scene))
     if settings.start is None:
         posed = with_colors(posed, settings.test_every, note, progress)
     checked = _checked_up(posed, setup)
@@ -329,8 +333,6 @@ def _photographed(scene: Scene) -> Scene:
 
 def _at_refined_poses(scene: Scene, setup: _Setup) -> Scene:
     """Return the scene at refined poses; those of the run to resume, if there is one."""
-    from splatseed.sfm import refined, with_refined  # noqa: PLC0415  (pycolmap is optional)
-
     if setup.earlier is not None:
         kept = load_scene(setup.folder.scene)
         if {image.name for image in scene.images} != {image.name for image in kept.images}:
@@ -340,13 +342,20 @@ def _at_refined_poses(scene: Scene, setup: _Setup) -> Scene:
     if was_upsampled(scene):
         raise ParameterError(
             "a scene that splatseed has not added points to, with `refine_poses`",
-            found="seeds, which triangulated points would replace",
+            found="seeds, which were made at the given poses",
             fix="Name the scene that they were made from, or refine before seeds are made: "
             "splatseed upsample SCENE --refine-poses -o OUT.",
         )
     settings = setup.settings
-    scene, message = refined(scene, settings.seed, setup.progress, test_every=settings.test_every)
-    setup.note(message)
+    color = partial(
+        with_colors, test_every=settings.test_every, note=setup.note, progress=setup.progress
+    )
+    scene, _, findings = refined(
+        scene, settings.seed, setup.progress,
+        test_every=settings.test_every, unfit_points=settings.unfit_points, color=color,
+    )  # fmt: skip
+    for finding in findings:
+        setup.note(finding)
     return scene
 
 

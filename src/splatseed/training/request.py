@@ -33,8 +33,8 @@ class PrepareOptions:
     """What to do with a run's folder and its poses, before training."""
 
     refine_poses: bool = False
-    """First refine a phone's or SLAM's poses; points triangulated there replace the scene's, unless
-    refinement gains nothing."""
+    """First refine a phone's or SLAM's poses, unless that gains nothing. Points are triangulated
+    there in place of those with tracks; others, such as LiDAR's, stay."""
     resume: bool = False
     """Resume the run in the output folder, with its own settings; start one if there is none."""
     tensorboard: bool = False

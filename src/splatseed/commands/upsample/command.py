@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -48,6 +49,7 @@ from splatseed.training.settings import TrainSettings
 if TYPE_CHECKING:  # Numba comes with them
     from splatseed.seeding.clouds.align import CloudAlignment
     from splatseed.seeding.clouds.method import Cloud, GivenClouds
+    from splatseed.sfm import RefinedScene
 
 SAMPLE = 10_000
 """Points read from a file to tell whether its coordinates include the scene's offset."""
@@ -81,13 +83,14 @@ def _upsample(options: Options, methods: dict[str, Any], arguments: list[str]) -
         note = _keep_or_announce(notes, clock)
         clock("read", 0.0)
         scene = _read(options, methods[options.method])
-        own, replaced = scene.points, 0
+        points_in = ""
         if options.gaussians is not None:  # photographs bound their sizes
             photo_methods.photographed(scene, without="leave out --gaussians")
         if options.refine_poses:
-            scene, refinement = _refined(options, scene, methods[options.method], clock)
-            replaced = 0 if scene.points is own else len(own)
-            notes.append(refinement)
+            own = int(scene.points.distinct.sum())
+            scene, kept, findings = _refined(options, scene, methods[options.method], note, clock)
+            points_in = report.triangulated(own, kept, len(scene.points))
+            notes += findings
         scene = _checked_up(options, scene, methods[options.method], note, clock)
         if options.recenter:
             scene = _recentered(scene, note)
@@ -105,7 +108,9 @@ def _upsample(options: Options, methods: dict[str, Any], arguments: list[str]) -
         total = None if new is None else count + new
         limit = None if options.budget is None else points_within(scene, options.budget)
     number = report.number_summary(total, limit, covered=options.cover_cell is not None)
-    _announce(options, scene, replaced, methods, number, "" if cloud is None else cloud.memory_note)
+    _announce(
+        options, scene, points_in, methods, number, "" if cloud is None else cloud.memory_note
+    )
     with stage_display(clock):
         seeds = upsample_checked(
             scene, method, num_points=total, budget=options.budget, cover=options.cover_cell,
@@ -130,7 +135,7 @@ def _upsample(options: Options, methods: dict[str, Any], arguments: list[str]) -
         text = f"The initial Gaussians are in {visible(options.gaussians)}."
         notes.append(Finding("gaussians-written", text, "info"))
     origins = report.origin_counts(seeds, options.method, written.num_points)
-    report.summarise(options, scene, replaced, origins, written, seconds, quality, arguments)
+    report.summarise(options, scene, points_in, origins, written, seconds, quality, arguments)
     print_note(*notes)
 
 
@@ -170,16 +175,20 @@ def _recentered(scene: Scene, note: Note) -> Scene:
 
 
 def _refined(
-    options: Options, scene: Scene, method: Upsampler, clock: StageClock
-) -> tuple[Scene, Finding]:
-    """Return the scene at refined poses, and what changed; no points of the method's test views."""
+    options: Options, scene: Scene, method: Upsampler, note: Note, clock: StageClock
+) -> RefinedScene:
+    """Return the scene at refined poses; no points of the method's test views."""
+    from splatseed.seeding.clouds.point_colors import with_colors
     from splatseed.sfm import refined
     from splatseed.sfm.first_look import FIRST_LOOK, NEIGHBOURS, STAGE
 
     look = [STAGE, NEIGHBOURS] if len(scene.images) > FIRST_LOOK.max_exhaustive else []
     clock.expect("features", *look, "matching", "refinement", "triangulation")
     test_every = getattr(method, "test_every", 0)
-    return refined(scene, options.seed, clock, test_every=test_every)
+    return refined(
+        scene, options.seed, clock, test_every=test_every, unfit_points=options.unfit_points,
+        color=partial(with_colors, test_every=test_every, note=note, progress=clock),
+    )  # fmt: skip
 
 
 def _write_extras(
@@ -222,7 +231,7 @@ def _write_start(path: Path, scene: Scene, method: Upsampler, progress: Progress
 def _announce(
     options: Options,
     scene: Scene,
-    replaced: int,
+    points_in: str,
     methods: Mapping[str, Upsampler],
     number: str,
     memory_note: str,
@@ -251,7 +260,7 @@ def _announce(
         maps = scene.depths if method.depth_maps else None
         where = "" if maps is None else ", around its depth maps"
         how = f": {points} points, so depth is found by comparing photographs{where}"
-    points = f"{counted(len(scene.points), 'point')}{report.in_place_of(replaced)}"
+    points = f"{counted(len(scene.points), 'point')}{points_in}"
     size = f"{counted(len(scene.images), 'image')}, {points}"
     print_message(
         f"{visible(options.scene)} ({scene.source.format}, {size})\n"

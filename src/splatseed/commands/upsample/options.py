@@ -70,8 +70,8 @@ class Options:
     default the folder masks beside the photographs. Transparent pixels are empty space around an
     object that is cut out, and do not count elsewhere; none: always empty, alpha: never."""
     refine_poses: bool = False
-    """First refine the poses, such as a phone's or SLAM's; points triangulated there replace the
-    scene's, unless refinement gains nothing."""
+    """First refine the poses, such as a phone's or SLAM's, unless that gains nothing. Points are
+    triangulated there in place of those with tracks; others, such as LiDAR's, stay."""
     unfit_points: UnfitPoints = "drop"
     """What to do with the scene's points where photographs contradict them: leave them out, move
     them by the similarity that fits, or keep them."""

@@ -108,14 +108,20 @@ def method_description(name: str, method: Upsampler, profile: Profile) -> str:
     return f"{name} ({', '.join(changes)})" if changes else name
 
 
-def in_place_of(replaced: int) -> str:
-    """Say whether refinement replaced the scene's points by triangulated ones; empty if not.
+def triangulated(own: int, kept: int, total: int) -> str:
+    """Say which of a number of points refinement triangulated; empty if none.
 
     Example:
-        >>> in_place_of(5740)
-        ", triangulated in place of the scene's 5,740"
+        >>> triangulated(5740, 0, 100), triangulated(5740, 5000, 5100)
+        (", triangulated in place of the scene's 5,740", ', 100 of them triangulated')
     """
-    return f", triangulated in place of the scene's {replaced:,}" if replaced else ""
+    if kept == total or not own:
+        return ""
+    return (
+        f", {total - kept:,} of them triangulated"
+        if kept
+        else f", triangulated in place of the scene's {own:,}"
+    )
 
 
 def number_summary(total: int | None, limit: int | None, *, covered: bool = False) -> str:
@@ -229,14 +235,17 @@ def colmap_command(arguments: Sequence[str], output: Path) -> str:
 def summarise(
     options: Options,
     scene: Scene,
-    replaced: int,
+    points_in: str,
     origins: Mapping[str, int],
     written: WriteReport,
     seconds: Mapping[str, float],
     found: Sequence[tuple[str, str]],
     arguments: Sequence[str],
 ) -> None:
-    """Print the final table and the commands to run next; ``arguments`` are those of the verb."""
+    """Print the final table and the commands to run next.
+
+    ``points_in`` adds to their number; ``arguments`` are those of the verb.
+    """
     output, left_out = options.output, []
     if written.dropped_nonfinite + written.dropped_duplicates:
         left_out += [f"{written.dropped_nonfinite:,} not finite"]
@@ -245,7 +254,7 @@ def summarise(
         left_out += [f"{thinned:,} originals, for the budget"]
     made = ", ".join(f"{count:,} {name}" for name, count in origins.items())
     rows = [
-        ("points in", f"{len(scene.points) + sum(scene.left_out):,}{in_place_of(replaced)}"),
+        ("points in", f"{len(scene.points) + sum(scene.left_out):,}{points_in}"),
         ("points out", f"{written.num_points:,} ({made})"),
         *([("left out", ", ".join(left_out))] if left_out else []),
         *found,
