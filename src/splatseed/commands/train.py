@@ -120,7 +120,8 @@ def _with_options(path: Path, content: Mapping[str, Any]) -> Options:
             )
         hint = hints[known[name]][name]
         is_path = Path in (hint, *get_args(hint)) and isinstance(value, str)
-        given[known[name]][name] = Path(value) if is_path else value
+        kind = Path if is_path else tuple if isinstance(value, list) else lambda same: same
+        given[known[name]][name] = kind(value)
         if not fits(given[known[name]][name], hint):
             raise SceneFormatError(
                 f"a value for {name} in {path} that the option takes",

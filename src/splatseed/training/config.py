@@ -13,6 +13,7 @@ from typing import Any
 
 from splatseed.checkup.wrong_poses import leave_out
 from splatseed.errors import ParameterError, SceneFormatError
+from splatseed.io.exclusion import exclude
 from splatseed.io.masks import mask_choice, masks_digest, with_masks
 from splatseed.io.photograph import photographs_digest
 from splatseed.io.staging import write_json
@@ -35,11 +36,12 @@ def make_config(
     *,
     refine_poses: bool = False,
     dropped: Collection[str] = (),
+    excluded: Collection[str] = (),
 ) -> dict[str, Any]:
     """Return the content of config.json.
 
     ``initial`` are the facts of the seeds or of the start, ``dropped`` the images that the run
-    leaves out for their poses.
+    leaves out for their poses, ``excluded`` those that the user leaves out.
     """
     source = scene.source
     points = None if refine_poses else source.points_path
@@ -56,6 +58,7 @@ def make_config(
         "photographs": photographs_digest(scene),
         "split": _names_of_parts(scene, settings),
         "dropped": sorted(dropped),
+        "exclude": sorted(excluded),
         "versions": {
             "python": platform.python_version(),
             **{name: version_of(name) for name in ("torch", "gsplat", "numba", "numpy")},
@@ -126,10 +129,16 @@ def has_run_poses(config: Mapping[str, Any], scene: Scene) -> bool:
 
 
 def without_dropped(scene: Scene, config: Mapping[str, Any]) -> Scene:
-    """Return a scene without the images that a run left out for their poses, and say so in it."""
-    dropped = config.get("dropped")
+    """Return a scene without the images that a run left out, and report them in it."""
+    dropped, scene = config.get("dropped"), exclude(scene, excluded_names(config, scene))
     scene, findings = leave_out(scene, dropped if isinstance(dropped, list) else ())
     return scene.replace(findings=(*scene.findings, *findings)) if findings else scene
+
+
+def excluded_names(config: Mapping[str, Any], scene: Scene) -> list[str]:
+    """Return the images of a scene that the user of a run left out."""
+    names = config.get("exclude")
+    return [name for name in names if name in scene] if isinstance(names, list) else []
 
 
 def check_same_input(folder: RunFolder, config: Mapping[str, Any], now: Mapping[str, Any]) -> None:

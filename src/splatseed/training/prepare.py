@@ -79,6 +79,7 @@ def prepare_run(
     options: PrepareOptions = NEW_RUN,
     *,
     named: Collection[str] = (),
+    excluded: Collection[str] = (),
     cache_dir: Path | None = None,
     depth_cache: DepthCache = NOT_CACHED,
     note: Note = silent_note,
@@ -92,6 +93,7 @@ def prepare_run(
         settings: How to train.
         options: What to do with the folder and the scene.
         named: Settings of the caller, which the run to resume must have even if they are defaults.
+        excluded: Photographs that the user left out of the scene, to be recorded.
         cache_dir: The folder for downsampled photographs; None: they are not kept.
         depth_cache: The file in which the depths for strategy grow are kept.
         note: Called with each finding for the user.
@@ -122,7 +124,7 @@ def prepare_run(
     initial = _initial(scene, setup)
     frame = initial.frame(scene, settings)
     dropped = [image.name for image in posed.images if image.name not in checked]
-    config = _checked_config(scene, initial, frame, setup, dropped)
+    config = _checked_config(scene, initial, frame, setup, dropped, excluded)
     views = load_split(
         scene,
         data_factor=settings.factor,
@@ -264,6 +266,7 @@ def _checked_config(
     frame: TrainingFrame,
     setup: _Setup,
     dropped: Collection[str],
+    excluded: Collection[str],
 ) -> dict[str, Any]:
     """Return the content of config.json, once it fits the memory and the run to resume."""
     for stray in stray_findings(frame.strays):
@@ -272,7 +275,7 @@ def _checked_config(
     check_fits(facts["count"], device)
     config = make_config(
         scene, facts, setup.settings, device_name(device), frame,
-        refine_poses=setup.refine_poses, dropped=dropped,
+        refine_poses=setup.refine_poses, dropped=dropped, excluded=excluded,
     )  # fmt: skip
     if setup.earlier:
         check_same_input(setup.folder, setup.earlier, config)

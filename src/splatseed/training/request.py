@@ -20,6 +20,11 @@ from splatseed.training.settings import Backend, TrainSettings
 
 MaskChoice = Annotated[str | None, tyro.conf.arg(metavar="DIR|none|inverted[:DIR]|alpha")]
 """The masks to use: see ``io.masks.with_masks``."""
+ExcludeChoice = Annotated[
+    tyro.conf.UseAppendAction[tuple[str, ...]],
+    tyro.conf.arg(metavar="NAME|PATTERN|FILE", help_behavior_hint="(repeatable)"),
+]
+"""The photographs to leave out: see ``io.exclusion.exclude``."""
 DEFAULTS = TrainSettings(strategy="auto", seeding="advised")
 """The settings of a new run of ``train``, those that score best; a resumed run has its own.
 
@@ -64,6 +69,8 @@ class TrainRequest(PrepareOptions):
     """A folder of masks, where pixels of 0 do not count, or none; inverted: only they count. By
     default the folder masks beside the photographs. Transparent pixels are empty space around an
     object that is cut out, and do not count elsewhere; none: always empty, alpha: never."""
+    exclude: ExcludeChoice = ()
+    """Photographs to leave out: a name, a pattern such as 'IMG_00*', or a .txt file of these."""
     named: tyro.conf.Suppress[frozenset[str]] = frozenset()
     """The settings that the caller named, which a run to resume must have, defaults or not."""
 
@@ -109,6 +116,9 @@ class EvaluateRequest:
     default the run's, else the folder masks beside the photographs. Transparent pixels are empty
     space around an object that is cut out, and do not count elsewhere; none: always empty, alpha:
     never."""
+    exclude: ExcludeChoice = ()
+    """Leave out test views, in addition to what the run left out: a name, a pattern such as
+    'IMG_00*', or a .txt file with one per line."""
     background: Annotated[str | None, tyro.conf.arg(metavar="black|white|R,G,B")] = None
     """The background of renders, over which transparent pixels of photographs are composited, too;
     by default what the trainer recorded beside the model (graphdeco's cfg_args, nerfstudio's

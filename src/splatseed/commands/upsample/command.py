@@ -18,6 +18,7 @@ from splatseed.findings import Finding
 from splatseed.io import load_originals, write_scene
 from splatseed.io.clouds import open_cloud
 from splatseed.io.colmap_model import scene_root
+from splatseed.io.exclusion import exclude
 from splatseed.io.load import with_depths_in, with_own_depths
 from splatseed.io.masks import with_masks
 from splatseed.io.nerfstudio import read_cloud_transform
@@ -200,7 +201,8 @@ def _write_extras(
 def _read(options: Options, method: Upsampler) -> Scene:
     """Read the scene's original points, and its depth maps if the method or an option uses them."""
     needed = "points" in traits_of(method).needs and not options.refine_poses  # it makes points
-    scene = with_masks(load_originals(options.scene, require_points=needed), options.masks)
+    scene = exclude(load_originals(options.scene, require_points=needed), options.exclude)
+    scene = with_masks(scene, options.masks)
     if options.depth_maps is not None:
         kind, scale = options.depth_kind, options.depth_scale
         return with_depths_in(scene, options.depth_maps, kind=kind, scale=scale)

@@ -18,7 +18,7 @@ from splatseed.methods import METHODS, Profile, Upsampler, configure
 from splatseed.runtime.memory import parse_bytes
 from splatseed.seeding.advice import DEFAULT_METHOD
 from splatseed.text import quoted
-from splatseed.training.request import MaskChoice
+from splatseed.training.request import ExcludeChoice, MaskChoice
 
 POINT_FILES = (".ply", ".las", ".laz", ".e57", ".pcd", ".xyz", ".pts", ".npz", ".bin", ".txt")
 """Suffixes that suggest the user wants a point file, not a scene folder."""
@@ -78,6 +78,8 @@ class Options:
     drop_wrong_poses: bool = False
     """Leave out single photographs whose poses do not fit the points that other photographs
     confirm."""
+    exclude: ExcludeChoice = ()
+    """Photographs to leave out: a name, a pattern such as 'IMG_00*', or a .txt file of these."""
     cloud_files: Annotated[
         tyro.conf.UseAppendAction[tuple[Path, ...]],
         tyro.conf.arg(name="cloud", metavar="FILE", help_behavior_hint="(repeatable)"),

@@ -83,6 +83,7 @@ def provenance(
         "method": options.method,
         "profile": options.profile,
         "parameters": parameters_of(method),
+        "exclude": options.exclude,
         "listed_tests_held_out": scene.listed is not None,
         "cloud": cloud if options.cloud_files else None,
         "depth": full(options.depth_maps),
