@@ -38,14 +38,18 @@ def test_a_text_file_holds_patterns(tmp_path):
     path.write_text("a[[]1].png\n\n  right/*  \n")
     assert matching_names(NAMES, [str(path)]) == {NAMES[2], NAMES[3]}
     path.write_text("a.png\n")
-    with pytest.raises(ParameterError, match=r"found 'a\.png' in .*blurred\.txt, which matches none"):
+    with pytest.raises(
+        ParameterError, match=r"found 'a\.png' in .*blurred\.txt, which matches none"
+    ):
         matching_names(NAMES, [str(path)])
     with pytest.raises(SceneNotFoundError, match="text file of names"):
         matching_names(NAMES, [str(tmp_path / "none.txt")])
 
 
 def test_a_pattern_that_matches_none_is_an_error_with_names():
-    with pytest.raises(ParameterError, match=r"such as a\[1\]\.png, für\.jpg, left/IMG_0001") as told:
+    with pytest.raises(
+        ParameterError, match=r"such as a\[1\]\.png, für\.jpg, left/IMG_0001"
+    ) as told:
         matching_names(NAMES, ["IMG_00*", "img_00*"])
     assert told.value.found == "'img_00*', which matches none of 5"
 

@@ -120,8 +120,7 @@ def _with_options(path: Path, content: Mapping[str, Any]) -> Options:
             )
         hint = hints[known[name]][name]
         is_path = Path in (hint, *get_args(hint)) and isinstance(value, str)
-        kind = Path if is_path else tuple if isinstance(value, list) else lambda same: same
-        given[known[name]][name] = kind(value)
+        given[known[name]][name] = Path(value) if is_path else value
         if not fits(given[known[name]][name], hint):
             raise SceneFormatError(
                 f"a value for {name} in {path} that the option takes",
@@ -154,6 +153,10 @@ def _read_config(path: Path, words: Collection[str]) -> dict[str, Any]:
         content["seeding"] = None if content.get("start") else content.get("seeding")
     elif seeds is not None:
         content["seeding"] = seeds
+    if (names := content.get("exclude")) is not None:
+        names = names if isinstance(names, list) else [names]
+        # Else the command line would append to it.
+        content["exclude"] = () if "exclude" in words else tuple(map(str, names))
     if isinstance(content.get("budget"), float):
         content["budget"] = str(content["budget"])
     excluded = {b for pair in EXCLUSIVE for a, b in (pair, pair[::-1]) if a in words} | RUN_FACTS
