@@ -91,6 +91,7 @@ def provenance(
         "num_points_asked": options.num_points,
         "budget": options.budget,
         "cover": options.cover_cell,
+        "region": options.region,
         "covered": None if coverage is None else {"cell": CELL, **coverage._asdict()},
         "seed": options.seed,
     }
