@@ -211,8 +211,8 @@ def _changed(plan: Plan, options: Options) -> Plan:
         fix = "--dry-run prints their order; a plan file may give paths for some scenes only."
         refuse((len(files) not in {0, len(scenes)}, expected, len(files), fix))
         if files:
-            pairs = zip(scenes, map(str, files), strict=True)
-            scenes = [replace(scene, **{what: file}) for scene, file in pairs]
+            named: list[dict[str, Any]] = [{what: str(file)} for file in files]
+            scenes = [replace(each, **one) for each, one in zip(scenes, named, strict=True)]
     return replace(plan, training=training, scenes=tuple(scenes), **changes)
 
 

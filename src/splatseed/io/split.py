@@ -34,8 +34,8 @@ def with_listed_split(scene: Scene) -> Scene:
         return scene
     findings = list(scene.findings)
     for origin, parts in _lists(scene):
-        split, names = _split(scene, origin, parts)
-        unknown = [name for name in names if name not in scene.absent]
+        split, unmatched = _split(scene, origin, parts)
+        unknown = [name for name in unmatched if name not in scene.absent]
         if split is not None:
             if unknown:  # typing errors, or images that SfM lost
                 shown = ", ".join(unknown[:_SHOWN]) + (", ..." if len(unknown) > _SHOWN else "")
