@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -60,7 +61,7 @@ def upsample(
     num_points: int | None = None,
     budget: int | str | None = None,
     cover: int | None = None,
-    region: str | Region | None = None,
+    region: str | Region | float | None = None,
     extra_method: Upsampler | None = None,
     seed: int = 0,
     profile: Profile = "default",
@@ -92,7 +93,8 @@ def upsample(
         region: Where new points are made: "x0,y0,z0,x1,y1,z1" for a box and others of
             ``parse_region``, or a function from positions [N, 3] to booleans [N]. The originals
             stay everywhere; ``ratio`` multiplies those within, and only new points within fill the
-            budget. Photographs are compared as without it.
+            budget. Photographs are compared as without it. A number is the parameter of that name
+            of method "depth".
         extra_method: A second method, such as ``Cloud().of("scan.laz")``. Its points come before
             those of ``method``, and "auto", "stereo" and "cover" only fill the gaps between them.
         seed: Seed of all random draws; the same seed gives the same bytes on any number of threads.
@@ -129,6 +131,9 @@ def upsample(
     """
     scene = _as_scene(scene)
     check_seed(seed)
+    if isinstance(region, Real):
+        method = resolve(method, profile, {**parameters, "region": region})[1]
+        region, parameters, profile = None, {}, "default"
     chosen = resolve(method, profile)[1]
     if "test_every" in parameters and isinstance(chosen, PhotographMethod):
         chosen = dataclasses.replace(chosen, test_every=parameters["test_every"])
