@@ -91,7 +91,7 @@ def test_the_commands_record_it(room_path, splatseed, tmp_path):
     run = splatseed("info", room_path, "--exclude", "view_001*", "--exclude", "view_002", "--json")
     assert json.loads(run.out)["images"] == len(load_scene(room_path).images) - 2
     text = splatseed("info", room_path, "--exclude", "view_00[12]*").out
-    assert "2 photographs are left out by --exclude: view_001.png, view_002.png" in text
+    assert "2 photographs are left out: view_001.png, view_002.png" in text
     lines = [line for line in text.splitlines() if "splatseed train" in line]
     assert all(line.endswith("--exclude 'view_00[12]*'") for line in lines)
     out = tmp_path / "out"

@@ -23,7 +23,8 @@ def _split(scene):
 def test_they_are_neither_trained_on_nor_tested(larger_room_path, tmp_path):
     scene, names = load_scene(larger_room_path), ["view_003.png", "view_004.png"]
     run = train(scene, tmp_path / "run", exclude=["view_00[34]*"], **QUICK)
-    assert run.config["exclude"] == names
+    assert run.config["excluded"] == names
+    assert run.config["exclude"] == ["view_00[34]*"]
     parts = [set(run.config["split"][part]) for part in ("train", "test")]
     assert parts == [part - {*names} for part in _split(scene)]
     notes = []
@@ -40,6 +41,15 @@ def test_they_are_neither_trained_on_nor_tested(larger_room_path, tmp_path):
     assert fewer.psnr == pytest.approx(sum(means) / len(means))
     with pytest.raises(ParameterError, match="some test views"):
         evaluate(run, exclude=sorted(parts[1]))
+
+
+def test_a_scene_without_some_is_scored_without_them(larger_room_path, tmp_path):
+    scene = load_scene(larger_room_path).without(["view_004.png", "view_005.png"])
+    run = train(scene, tmp_path / "run", **QUICK)
+    notes = []
+    scores = evaluate(run, note=notes.append)  # the files have all
+    assert {view.name for view in scores.per_image} == set(run.config["split"]["test"])
+    assert [(each.kind, [*each.subjects]) for each in notes] == [(EXCLUDED, run.config["excluded"])]
 
 
 def test_a_resumed_run_leaves_out_the_same(larger_room_path, tmp_path):

@@ -58,8 +58,8 @@ MIN_STEPS, WINDOW, REPORT_AFTER, ESTIMATE_EVERY = 5, 100, 10.0, 5
 printed, and steps between estimates."""
 MIN_REPORTED = 120.0
 """Seconds of remaining training from which on they are printed."""
-RUN_FACTS = {"splatseed", "points", "photographs", "split", "dropped", "mask_files", "device",
-    "versions", "near_plane", "frame"}  # fmt: skip
+RUN_FACTS = {"splatseed", "points", "photographs", "split", "dropped", "excluded", "mask_files",
+    "device", "versions", "near_plane", "frame"}  # fmt: skip
 """Keys of config.json that are not options."""
 EXCLUSIVE = (("start", "seeding"), ("start", "refine_poses"), ("long_side", "data_factor"))
 """Pairs of exclusive options: one on the command line replaces the other of a file."""

@@ -49,9 +49,9 @@ def exclude(scene: Scene, patterns: str | Sequence[str]) -> Scene:
 
 
 def excluded_finding(names: Sequence[str]) -> Finding:
-    """Return the finding on photographs that the user leaves out."""
+    """Return the finding on photographs that the user, or a run, leaves out."""
     are = agreeing(len(names), "is", "are")
-    text = f"{counted(len(names), 'photograph')} {are} left out by `exclude`: "
+    text = f"{counted(len(names), 'photograph')} {are} left out: "
     return Finding(EXCLUDED, f"{text}{name_some(names, _SHOWN)}.", "info", tuple(names))
 
 

@@ -181,7 +181,6 @@ def prepare_training(
     patterns: Sequence[str] = request.exclude
     if resumed is not None and not patterns:
         patterns = excluded_names(resumed.read_config(), scene)
-    whole = scene
     scene = with_masks(exclude(scene, patterns), request.masks)
     for finding in scene.findings:
         note(finding)
@@ -198,8 +197,7 @@ def prepare_training(
     named |= {"data_factor"} if request.long_side is not None else set()
     return prepare_run(
         scene, output, settings, request,
-        named=named, excluded=[im.name for im in whole.images if im.name not in scene],
-        cache_dir=user_cache_dir(), note=note, progress=progress,
+        named=named, cache_dir=user_cache_dir(), note=note, progress=progress,
     )  # fmt: skip
 
 

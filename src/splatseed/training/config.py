@@ -9,6 +9,7 @@ import dataclasses
 import math
 import platform
 from collections.abc import Collection, Mapping
+from types import MappingProxyType
 from typing import Any
 
 from splatseed.checkup.wrong_poses import leave_out
@@ -35,13 +36,12 @@ def make_config(
     frame: TrainingFrame | None = None,
     *,
     refine_poses: bool = False,
-    dropped: Collection[str] = (),
-    excluded: Collection[str] = (),
+    left_out: Mapping[str, Collection[str]] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Return the content of config.json.
 
-    ``initial`` are the facts of the seeds or of the start, ``dropped`` the images that the run
-    leaves out for their poses, ``excluded`` those that the user leaves out.
+    ``initial`` are the facts of the seeds or of the start. ``left_out`` are images that the run
+    leaves out: "dropped" for their poses, "excluded" before, by patterns "exclude" or otherwise.
     """
     source = scene.source
     points = None if refine_poses else source.points_path
@@ -57,8 +57,7 @@ def make_config(
         "seeds": dict(initial),
         "photographs": photographs_digest(scene),
         "split": _names_of_parts(scene, settings),
-        "dropped": sorted(dropped),
-        "exclude": sorted(excluded),
+        **{name: sorted(names) for name, names in left_out.items()},
         "versions": {
             "python": platform.python_version(),
             **{name: version_of(name) for name in ("torch", "gsplat", "numba", "numpy")},
@@ -136,8 +135,8 @@ def without_dropped(scene: Scene, config: Mapping[str, Any]) -> Scene:
 
 
 def excluded_names(config: Mapping[str, Any], scene: Scene) -> list[str]:
-    """Return the images of a scene that the user of a run left out."""
-    names = config.get("exclude")
+    """Return the images of a scene that a run left out from the beginning."""
+    names = config.get("excluded")
     return [name for name in names if name in scene] if isinstance(names, list) else []
 
 

@@ -20,6 +20,7 @@ from splatseed.checkup.wrong_poses import leave_out, without_wrong_poses
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.findings import Finding
 from splatseed.io import load_scene
+from splatseed.io.exclusion import exclude
 from splatseed.io.files import StrPath
 from splatseed.io.photograph_checks import check_sizes, with_photographs
 from splatseed.io.seeds import was_upsampled
@@ -79,7 +80,6 @@ def prepare_run(
     options: PrepareOptions = NEW_RUN,
     *,
     named: Collection[str] = (),
-    excluded: Collection[str] = (),
     cache_dir: Path | None = None,
     depth_cache: DepthCache = NOT_CACHED,
     note: Note = silent_note,
@@ -93,7 +93,6 @@ def prepare_run(
         settings: How to train.
         options: What to do with the folder and the scene.
         named: Settings of the caller, which the run to resume must have even if they are defaults.
-        excluded: Photographs that the user left out of the scene, to be recorded.
         cache_dir: The folder for downsampled photographs; None: they are not kept.
         depth_cache: The file in which the depths for strategy grow are kept.
         note: Called with each finding for the user.
@@ -110,6 +109,8 @@ def prepare_run(
         ReconstructionError: Poses cannot be refined.
         MissingDependencyError: TensorBoard or pycolmap is needed and absent.
     """
+    scene = exclude(scene, options.exclude)
+    excluded = scene.absent
     scene = _photographed(scene)  # before the folder is checked, which may be a bare cloud's
     scene, setup = _set_up(scene, Path(output), settings, options, named, note, progress)
     settings, folder = setup.settings, setup.folder
@@ -124,7 +125,8 @@ def prepare_run(
     initial = _initial(scene, setup)
     frame = initial.frame(scene, settings)
     dropped = [image.name for image in posed.images if image.name not in checked]
-    config = _checked_config(scene, initial, frame, setup, dropped, excluded)
+    left_out = {"exclude": options.exclude, "excluded": excluded, "dropped": dropped}
+    config = _checked_config(scene, initial, frame, setup, left_out)
     views = load_split(
         scene,
         data_factor=settings.factor,
@@ -265,8 +267,7 @@ def _checked_config(
     initial: _Seeds | _Start,
     frame: TrainingFrame,
     setup: _Setup,
-    dropped: Collection[str],
-    excluded: Collection[str],
+    left_out: Mapping[str, Collection[str]],
 ) -> dict[str, Any]:
     """Return the content of config.json, once it fits the memory and the run to resume."""
     for stray in stray_findings(frame.strays):
@@ -275,7 +276,7 @@ def _checked_config(
     check_fits(facts["count"], device)
     config = make_config(
         scene, facts, setup.settings, device_name(device), frame,
-        refine_poses=setup.refine_poses, dropped=dropped, excluded=excluded,
+        refine_poses=setup.refine_poses, left_out=left_out,
     )  # fmt: skip
     if setup.earlier:
         check_same_input(setup.folder, setup.earlier, config)

@@ -35,11 +35,13 @@ scene's points: plans of ``bench`` start from it, to compare methods as in 3DGS.
 
 @dataclass(frozen=True)
 class PrepareOptions:
-    """What to do with a run's folder and its poses, before training."""
+    """What to do with a run's folder, its poses and photographs, before training."""
 
     refine_poses: bool = False
     """First refine a phone's or SLAM's poses; points triangulated there replace the scene's, unless
     refinement gains nothing."""
+    exclude: ExcludeChoice = ()
+    """Photographs to leave out: a name, a pattern such as 'IMG_00*', or a .txt file of these."""
     resume: bool = False
     """Resume the run in the output folder, with its own settings; start one if there is none."""
     tensorboard: bool = False
@@ -69,8 +71,6 @@ class TrainRequest(PrepareOptions):
     """A folder of masks, where pixels of 0 do not count, or none; inverted: only they count. By
     default the folder masks beside the photographs. Transparent pixels are empty space around an
     object that is cut out, and do not count elsewhere; none: always empty, alpha: never."""
-    exclude: ExcludeChoice = ()
-    """Photographs to leave out: a name, a pattern such as 'IMG_00*', or a .txt file of these."""
     named: tyro.conf.Suppress[frozenset[str]] = frozenset()
     """The settings that the caller named, which a run to resume must have, defaults or not."""
 
