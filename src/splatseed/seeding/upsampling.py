@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -131,7 +130,7 @@ def upsample(
     """
     scene = _as_scene(scene)
     check_seed(seed)
-    if isinstance(region, Real):
+    if isinstance(region, int | float):
         method = resolve(method, profile, {**parameters, "region": region})[1]
         region, parameters, profile = None, {}, "default"
     chosen = resolve(method, profile)[1]
