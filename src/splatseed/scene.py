@@ -9,7 +9,7 @@ its images open, when needed: cameras are in pixels of the photographs' files.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace as dataclass_replace
 from difflib import get_close_matches
@@ -275,6 +275,18 @@ class Tracks:
             point2d_idx=self.point2d_idx[observed],
         )
 
+    def seen_by(self, image_ids: Sequence[int]) -> Tracks:
+        """Return the tracks without the observations of other images than these."""
+        kept = np.isin(self.image_ids, image_ids)
+        point_idx = np.repeat(np.arange(len(self)), self.lengths)[kept]
+        lengths = np.bincount(point_idx, minlength=len(self))
+        return dataclass_replace(
+            self,
+            offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
+            image_ids=self.image_ids[kept],
+            point2d_idx=self.point2d_idx[kept],
+        )
+
 
 @dataclass(frozen=True)
 class SceneSource:
@@ -422,6 +434,19 @@ class Scene:
     def with_points(self, points: PointCloud) -> Scene:
         """Return a copy with other points; ``replace`` describes which tracks are kept."""
         return self.replace(points=points)
+
+    def without(self, names: Iterable[str]) -> Scene:
+        """Return a copy without the images of some names, which become ``absent``.
+
+        Points stay; their tracks lose the observations there.
+
+        Raises:
+            UnknownNameError: There is no such image; the message lists similar names.
+        """
+        gone = {self[name].name: None for name in names}
+        images = tuple(image for image in self.images if image.name not in gone)
+        tracks = self.tracks and self.tracks.seen_by([image.image_id for image in images])
+        return self.replace(images=images, tracks=tracks, absent=(*self.absent, *gone))
 
     def with_depths(self, depths: Any) -> Scene:
         """Return a copy with other depth maps.

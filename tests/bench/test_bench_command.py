@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -184,6 +185,19 @@ def test_options_make_a_plan_smaller(bench, own_room, tmp_path):
     assert [scene.name for scene in plan.scenes] == ["desk", "fern"]
     assert (plan.ratios, plan.budgets, plan.repeats) == ((4, 8, 16), ("9rho",), 1)
     assert "# 136 runs" in out
+
+
+def test_photographs_are_left_out_of_a_single_scene(bench, own_room, tmp_path):
+    words = ("--max-steps", 3, "--exclude", "view_003*", "--dry-run")
+    code, out, _ = bench("--scenes", own_room, *words)
+    assert code == 0
+    (tmp_path / "plan.toml").write_text(out)
+    (scene,) = read_plan(tmp_path / "plan.toml").scenes
+    assert scene.exclude == ("view_003*",)
+    facts, whole = survey(scene), survey(replace(scene, exclude=()))
+    assert facts.num_images == whole.num_images - 1
+    assert facts.digest != whole.digest
+    assert bench("--scenes", own_room, tmp_path, *words).code == 2
 
 
 def test_the_synthetic_room_is_made_once(bench, tmp_path, monkeypatch):

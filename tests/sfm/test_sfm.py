@@ -29,7 +29,7 @@ from splatseed.runtime import child
 from splatseed.scene import Scene, Split
 from splatseed.sfm import Settings, mapping, reconstruct
 from splatseed.sfm.export import clear_orientation, drop_folded, drop_repeats
-from splatseed.sfm.photos import find_photos
+from splatseed.sfm.photos import EXCLUDED, find_photos
 from splatseed.similarity import fit_similarity
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -238,6 +238,23 @@ def test_reduced_copies_are_no_photographs(photos, tmp_path):
     assert folders == {"images": 2, "images_2": 1, "images_8x": 2, "b/images": 2}
     (copies,) = left_out.values()
     assert len(copies) == 5
+
+
+def test_photographs_to_leave_out_are_not_even_read(photos, tmp_path, splatseed):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for number in range(4):
+        shutil.copy(photos / f"view_00{number}.png", folder)
+    (folder / "bad_1.jpg").write_bytes(b"cut off")
+    found, left_out = find_photos(folder, ["bad_*", "view_003"])
+    assert [*found] == ["view_000.png", "view_001.png", "view_002.png"]
+    assert left_out == {EXCLUDED: ["bad_1.jpg", "view_003.png"]}
+    for pattern, said in (("view_*", "at least 2 photographs"), ("img*", "matches none of 5")):
+        run = splatseed(
+            "sfm", folder, "--exclude", pattern, "--exclude", "bad_1", "-o", tmp_path / "o"
+        )
+        assert run.code == 2
+        assert said in run.err
 
 
 def test_a_dying_process_is_one_clear_error(photos, tmp_path, monkeypatch):

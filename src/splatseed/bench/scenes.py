@@ -20,6 +20,7 @@ from splatseed.io import load_originals
 from splatseed.io.clouds import open_cloud
 from splatseed.io.colmap_model import scene_root
 from splatseed.io.downsampling import reduced_size
+from splatseed.io.exclusion import exclude
 from splatseed.io.files import open_file, read_bytes
 from splatseed.io.load import search_depths, with_depths_in
 from splatseed.io.photograph import photograph_bytes
@@ -48,6 +49,11 @@ class PlannedScene:
     """The folder of depth maps; searched in the scene if empty."""
     cloud: str = ""
     """The file of a scan in the scene's frame."""
+    exclude: tuple[str, ...] = ()
+    """Photographs to leave out: names or patterns."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "exclude", tuple(self.exclude))  # JSON has lists
 
     @property
     def is_demo(self) -> bool:
@@ -100,7 +106,7 @@ def open_scene(scene: PlannedScene) -> Scene:
         SceneNotFoundError: There is no scene or folder, or half of the photographs are missing.
         SceneFormatError: A file is invalid.
     """
-    opened = load_originals(Path(scene.path))
+    opened = exclude(load_originals(Path(scene.path)), scene.exclude)
     if scene.images:
         folder = (opened.source.root or Path()) / scene.images
         if not folder.is_dir():
@@ -166,7 +172,7 @@ def survey(
     for finding in (*scene.findings, *split, *stray_cameras(scene)):
         note(finding)
     return SceneFacts(
-        str(path.resolve()), planned.label, planned.images, maps, scan,
+        str(path.resolve()), planned.label, planned.images, maps, scan, planned.exclude,
         num_points=len(scene.points), num_images=len(scene.images), pixels=size[0] * size[1],
         long_side=max(size), **fingerprints(scene, maps, scan, progress),
     )  # fmt: skip

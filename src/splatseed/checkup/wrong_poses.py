@@ -188,11 +188,9 @@ def leave_out(scene: Scene, wrong: Collection[str]) -> tuple[Scene, tuple[Findin
     names = tuple(sorted({name for name in wrong if name in scene}))
     if not names:
         return scene, ()
-    images = tuple(image for image in scene.images if image.name not in names)
-    left = scene.replace(images=images, absent=(*scene.absent, *names))
     which = agreeing(
         len(names), "that does not fit the points is", "that do not fit the points are"
     )
     text = f"{counted(len(names), 'photograph')} {which} left out: "
     text += f"{', '.join(names[:NAMED])}{' ...' if len(names) > NAMED else ''}."
-    return left, (Finding(WRONG_POSES, text, "info", names),)
+    return scene.without(names), (Finding(WRONG_POSES, text, "info", names),)

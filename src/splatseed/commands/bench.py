@@ -53,12 +53,14 @@ from splatseed.console import (
 )
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.findings import Finding
+from splatseed.io.exclusion import read_patterns
 from splatseed.io.staging import atomic_file
 from splatseed.methods import Profile
 from splatseed.requirements import require
 from splatseed.runtime.interruption import exit_code
 from splatseed.runtime.memory import check_memory
 from splatseed.text import counted, did_you_mean, format_duration, name_some, quoted, visible
+from splatseed.training.request import ExcludeChoice
 from splatseed.training.settings import BYTES_PER_GAUSSIAN, Backend, StrategyName
 
 if TYPE_CHECKING:
@@ -117,6 +119,9 @@ class Options:
     default those of the scene."""
     clouds: tuple[Path, ...] = ()
     """Scans for cloud and cloud+auto: a file per scene, in its frame (docs/scans.md)."""
+    exclude: ExcludeChoice = ()
+    """Leave out photographs of a single scene: a name, a pattern such as 'IMG_00*', or a .txt file
+    with one per line; a plan has them for each scene."""
     plan: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A plan file, as --dry-run prints; options override it."""
     data: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
@@ -192,7 +197,7 @@ def _changed(plan: Plan, options: Options) -> Plan:
         changes["ratios"] = options.ratios
     if plan is _DEFAULT and not options.budgets and "paper" not in options.profiles:
         changes["budgets"] = (fair_budget(changes.get("ratios", plan.ratios)),)
-    scenes = _scenes(plan, options)
+    scenes = _without_excluded(_scenes(plan, options), options.exclude)
     labels = Counter(scene.label for scene in scenes)
     for i, scene in enumerate(scenes):  # prefix equal folder names with their parents'
         if labels[scene.label] > 1 and not scene.is_demo and not scene.name:
@@ -206,9 +211,17 @@ def _changed(plan: Plan, options: Options) -> Plan:
         fix = "--dry-run prints their order; a plan file may give paths for some scenes only."
         refuse((len(files) not in {0, len(scenes)}, expected, len(files), fix))
         if files:
-            pairs = zip(scenes, map(str, files), strict=True)
-            scenes = [replace(scene, **{what: file}) for scene, file in pairs]
+            named: list[dict[str, Any]] = [{what: str(file)} for file in files]
+            scenes = [replace(each, **one) for each, one in zip(scenes, named, strict=True)]
     return replace(plan, training=training, scenes=tuple(scenes), **changes)
+
+
+def _without_excluded(scenes: list[PlannedScene], patterns: Sequence[str]) -> list[PlannedScene]:
+    if not patterns:
+        return scenes
+    fix = "A plan has a key exclude for each scene."
+    refuse((len(scenes) != 1, "--exclude with one scene", len(scenes), fix))
+    return [replace(scenes[0], exclude=tuple(each for each, _ in read_patterns(patterns)))]
 
 
 def _scenes(plan: Plan, options: Options) -> list[PlannedScene]:

@@ -132,6 +132,7 @@ def _score(
         "scene": evaluation.scene,
         "data_factor": model.data_factor,
         "test_every": evaluation.test_every,
+        "exclude": evaluation.request.exclude,
         "background": name_background(model.scene.background),
         **result.to_dict(),
     }

@@ -14,7 +14,9 @@ from splatseed.commands.options import check_free, parse_options, refuse
 from splatseed.console import add_results, print_next, print_note, print_pairs, stage_display
 from splatseed.errors import InputError, ParameterError
 from splatseed.findings import Finding
+from splatseed.io.matrices import parse_similarity
 from splatseed.io.origin import RECENTER, choose_origin, format_offset, offset_beside, write_offset
+from splatseed.io.regions import REGION_FORM, Region, parse_region
 from splatseed.photos.view import NO_PIXELS
 from splatseed.progress import Note, Progress
 from splatseed.requirements import require, version_of
@@ -24,15 +26,12 @@ from splatseed.similarity import Similarity
 from splatseed.splat.background import background_of, name_background
 from splatseed.splat.formats import FORMATS, format_of_name, read_gaussians, write_gaussians
 from splatseed.splat.gaussians import Gaussians
-from splatseed.splat.matrices import parse_similarity
 from splatseed.splat.model_frame import transform_gaussians, translate_gaussians
 from splatseed.splat.selection import (
-    Region,
     filter_gaussians,
     isolated,
     kept_by_filter,
     largest,
-    parse_crop,
     visible_area,
 )
 from splatseed.text import counted, quoted, visible
@@ -65,7 +64,7 @@ class Options:
     scene: Path | None = None
     """The scene of a file of Gaussians, for --budget and the score that the format costs; a run has
     its own."""
-    crop: Annotated[str | None, tyro.conf.arg(metavar="x0,y0,z0,x1,y1,z1|x,y,z,r|FILE")] = None
+    crop: Annotated[str | None, tyro.conf.arg(metavar=REGION_FORM)] = None
     """Keep the Gaussians whose centres lie in this box, sphere (centre, radius), or turned box (a
     file or 16 numbers: the matrix from a cube of side 1 around 0), in the model's coordinates;
     write --crop=-1,... if the first number is negative."""
@@ -152,7 +151,7 @@ def _checked(options: Options) -> _Job:
     target, path = options.output, model_file(options.model)
     page = target.name.lower().endswith(PAGE)
     name = PAGE if page else format_of_name(target, (PAGE,))
-    crop = None if options.crop is None else parse_crop(options.crop)
+    crop = None if options.crop is None else parse_region(options.crop, "crop")
     transform = None if options.transform is None else parse_similarity(options.transform)
     cleans = options.clean is not None
     config = config_of(options.model)

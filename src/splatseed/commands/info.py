@@ -36,6 +36,7 @@ from splatseed.depth.settings import DepthSettings
 from splatseed.depthmap import DepthKind, DepthMaps, in_scene_units
 from splatseed.findings import Finding
 from splatseed.io import load_scene
+from splatseed.io.exclusion import exclude
 from splatseed.io.load import depths_beside, with_depths_in
 from splatseed.io.seeds import was_upsampled
 from splatseed.photos.camera_check import stray_cameras
@@ -47,6 +48,7 @@ from splatseed.seeding.clouds.point_colors import missing_color_findings
 from splatseed.seeding.photo_methods import Auto, photographed
 from splatseed.text import counted, quoted, visible
 from splatseed.training.folder import RunFolder
+from splatseed.training.request import ExcludeChoice
 from splatseed.training.schedule import FULL_RUN
 
 if TYPE_CHECKING:  # Numba, which takes a while to load, comes with it
@@ -83,6 +85,8 @@ class Options:
     """Steps that you plan to train, for the commands that are printed."""
     trainer: Annotated[TrainerName, tyro.conf.arg(name="for")] = "splatseed"
     """The trainer that you plan to use: the advice and the commands are for it."""
+    exclude: ExcludeChoice = ()
+    """Photographs to leave out: a name, a pattern such as 'IMG_00*', or a .txt file of these."""
     all_photographs: bool = False
     """Compare all photographs with the points, not 150 at most, to find single wrong poses."""
 
@@ -192,7 +196,16 @@ def _show(options: Options, scene: Scene, facts: _Facts) -> None:
         commands = _next(options, usable, advice, planned, facts.known, check.poses)
         if check.first and len(scene.points):
             commands = [("once that is mended", f"splatseed info {quoted(options.scene)}")]
-        print_next(commands)
+        print_next(_excluding(commands, options.exclude))
+
+
+def _excluding(commands: Commands, patterns: Sequence[str]) -> Commands:
+    """Add ``--exclude`` to the commands that read the scene's photographs."""
+    words = "".join(f" --exclude {quoted(pattern)}" for pattern in patterns)
+    verbs = tuple(
+        f"splatseed {verb} " for verb in ("info", "upsample", "train", "sfm", "undistort")
+    )
+    return [(label, f"{line}{words * line.startswith(verbs)}") for label, line in commands]
 
 
 def _shows_model(options: Options) -> bool:
@@ -204,7 +217,8 @@ def _shows_model(options: Options) -> bool:
 
     if not is_model(options.scene):
         return False
-    given = options.depth, options.depth_kind, options.depth_scale, options.picture, options.budget
+    given = (options.depth, options.depth_kind, options.depth_scale, options.picture,
+             options.budget, options.exclude or None)  # fmt: skip
     found = f"trained Gaussians at {visible(options.scene)}"
     expected = "a scene, for options about depth and budgets"
     fix = "Drop these options, or name the scene."
@@ -228,7 +242,7 @@ def _read(options: Options) -> Scene:
         refuse((wrong, "a file that ends in .png, for --picture", visible(name), fix))
         inputs = [each for each in (options.scene, options.depth) if each is not None]
         check_free(options.picture, protect=inputs, fix="Choose another name, or remove it.")
-    scene = load_scene(options.scene, require_points=False)
+    scene = exclude(load_scene(options.scene, require_points=False), options.exclude)
     if options.depth is None:
         return scene
     kind, scale = options.depth_kind, options.depth_scale

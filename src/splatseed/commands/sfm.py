@@ -37,6 +37,7 @@ from splatseed.sfm.first_look import FIRST_LOOK, NEIGHBOURS, STAGE
 from splatseed.sfm.panoramas import PanoramasName
 from splatseed.sfm.photos import pick_frames
 from splatseed.text import counted, name_some, quoted, visible
+from splatseed.training.request import ExcludeChoice
 
 if TYPE_CHECKING:  # Numba, for which --help would wait, comes with it
     from splatseed.checkup.pose_accuracy import PoseErrorEstimate
@@ -61,6 +62,8 @@ class Options:
     refine_poses: bool = False
     """Refine the poses of --poses-from first, such as those of a phone or SLAM, which are off by a
     degree or two."""
+    exclude: ExcludeChoice = ()
+    """Photographs to leave out: a name, a pattern such as 'IMG_00*', or a .txt file of these."""
     matcher: MatcherName = "auto"
     """Match all pairs of images (exhaustive), each image with the next ones by name (sequential),
     or the pairs that a first look at few features finds to overlap (auto)."""
@@ -170,6 +173,7 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
         overwrite=options.overwrite,
         on_progress=clock,
         note=print_note,
+        exclude=options.exclude,
         on_photos=partial(_report_photographs, options, images, capture, clock, stages, poses),
         **how,
     )

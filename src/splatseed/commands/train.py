@@ -58,8 +58,8 @@ MIN_STEPS, WINDOW, REPORT_AFTER, ESTIMATE_EVERY = 5, 100, 10.0, 5
 printed, and steps between estimates."""
 MIN_REPORTED = 120.0
 """Seconds of remaining training from which on they are printed."""
-RUN_FACTS = {"splatseed", "points", "photographs", "split", "dropped", "mask_files", "device",
-    "versions", "near_plane", "frame"}  # fmt: skip
+RUN_FACTS = {"splatseed", "points", "photographs", "split", "dropped", "excluded", "mask_files",
+    "device", "versions", "near_plane", "frame"}  # fmt: skip
 """Keys of config.json that are not options."""
 EXCLUSIVE = (("start", "seeding"), ("start", "refine_poses"), ("long_side", "data_factor"))
 """Pairs of exclusive options: one on the command line replaces the other of a file."""
@@ -153,6 +153,10 @@ def _read_config(path: Path, words: Collection[str]) -> dict[str, Any]:
         content["seeding"] = None if content.get("start") else content.get("seeding")
     elif seeds is not None:
         content["seeding"] = seeds
+    if (names := content.get("exclude")) is not None:
+        names = names if isinstance(names, list) else [names]
+        # Else the command line would append to it.
+        content["exclude"] = () if "exclude" in words else tuple(map(str, names))
     if isinstance(content.get("budget"), float):
         content["budget"] = str(content["budget"])
     excluded = {b for pair in EXCLUSIVE for a, b in (pair, pair[::-1]) if a in words} | RUN_FACTS

@@ -14,6 +14,7 @@ from splatseed.console import add_results, print_next, print_note, print_pairs, 
 from splatseed.findings import Finding, without_kinds
 from splatseed.io import load_scene
 from splatseed.io.depth_maps import DepthFiles
+from splatseed.io.exclusion import exclude
 from splatseed.io.load import depths_beside
 from splatseed.io.seeds import was_upsampled
 from splatseed.io.staging import check_output
@@ -22,6 +23,7 @@ from splatseed.requirements import require
 from splatseed.seeding.advice import is_distorted
 from splatseed.sfm import undistort
 from splatseed.text import agreeing, counted, quoted
+from splatseed.training.request import ExcludeChoice
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,8 @@ class Options:
     """A scene with photographs, in any layout."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The scene folder to write, in COLMAP's layout."""
+    exclude: ExcludeChoice = ()
+    """Photographs to leave out: a name, a pattern such as 'IMG_00*', or a .txt file of these."""
     mask_below: float = 0.0
     """Mask panoramas within this angle of straight down, in degrees, where the photographer is."""
     overwrite: bool = False
@@ -47,6 +51,7 @@ def run(arguments: list[str]) -> None:
     with stage_display(lines=True) as clock:
         clock("read", 0.0)
         scene = load_scene(options.scene, require_points=False, panoramas=True)
+        scene = exclude(scene, options.exclude)
         whole = sum(image.intrinsics.is_panorama for image in scene.images)
         clock.count(len(scene.images) + (len(FACES) - 1) * whole, "photographs", "undistortion")
         report = undistort(

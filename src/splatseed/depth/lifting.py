@@ -30,14 +30,15 @@ from splatseed.errors import PointCloudError, SceneFormatError, SceneNotFoundErr
 from splatseed.findings import Finding
 from splatseed.io.origin import translated_image
 from splatseed.io.photograph_checks import with_photographs
+from splatseed.io.regions import Region
 from splatseed.photos.sizes import default_factor
 from splatseed.photos.visibility import Visibility, find_visibility
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Image, Scene
 from splatseed.text import agreeing
 
-SOUND, UNCONFIRMED, NEAR_EDGE, SEEN_THROUGH = range(4)
-"""Tiers, in the order in which they are used; the last is never used."""
+SOUND, UNCONFIRMED, NEAR_EDGE, SEEN_THROUGH, OUTSIDE = range(5)
+"""Tiers, in the order in which they are used; the last two are never used."""
 POINTS_PER_PIXEL = 0.25
 """Points for a scene without any, per pixel of a photograph at the size that is trained."""
 VIEWS_PER_TASK = 4
@@ -71,8 +72,9 @@ def lift(
     settings: DepthSettings,
     rng: np.random.Generator,
     progress: Progress = silent,
+    within: Region | None = None,
 ) -> tuple[Float32[np.ndarray, "M 3"], UInt8[np.ndarray, "M 3"], tuple[Finding, ...]]:
-    """Lift ``num`` pixels of a scene's images into its world.
+    """Lift ``num`` pixels of a scene's images into its world, or into the region ``within``.
 
     Each image and its map are read once, and again only if too few candidates are sound.
 
@@ -99,16 +101,19 @@ def lift(
     candidates = _gather(views, settings, progress)
     if not settings.align and settings.min_agreeing:  # nothing else checks unit and poses
         _check_agreement(candidates, len(views))
+    _mark_outside(candidates, center, within)
+    limit = OVERSAMPLING.limit if within is None else math.inf  # it may be small
     while (
         (sound := int(np.count_nonzero(candidates.tier == SOUND))) < num
-        and factor < OVERSAMPLING.limit
+        and factor < limit
         and not all(v.exhausted for v in views)
     ):
         # In proportion to the sound ones, so that one more round mostly suffices.
         growth = OVERSAMPLING.plain * num / max(sound, 1)
-        factor = min(factor * min(growth, OVERSAMPLING.max_growth), OVERSAMPLING.limit)
+        factor = min(factor * min(growth, OVERSAMPLING.max_growth), limit)
         views = _read_views(scene, images, visibility, factor * num, settings, rng, progress)
         candidates = _gather(views, settings, progress)
+        _mark_outside(candidates, center, within)
     progress("choose points", 0.0)
     points = scene.points.originals
     chosen = _choose(candidates, np.asarray(points.xyz[points.finite]), num, settings, rng)
@@ -304,6 +309,14 @@ def _gather(views: Sequence[DepthView], settings: DepthSettings, progress: Progr
     return candidates
 
 
+def _mark_outside(
+    candidates: _Candidates, center: Float64[np.ndarray, " 3"], within: Region | None
+) -> None:
+    """Mark candidates outside of a region of the scene."""
+    if within is not None:
+        candidates.tier[~within(candidates.xyz + center)] = OUTSIDE
+
+
 def _check_agreement(candidates: _Candidates, num_views: int) -> None:
     """Raise ``SceneFormatError`` if the maps of three views or more contradict one another."""
     confirmed = int(np.count_nonzero(candidates.confirmed))
@@ -334,11 +347,12 @@ def _choose(
     if usable < num:
         more = [] if settings.see_through else ["`depth.see_through=True`"]
         more += ["a larger `depth.region`"] if settings.region < 1 else []
+        inside = " in the region" if (candidates.tier == OUTSIDE).any() else ""
         seen = "" if settings.see_through else " that no other view sees through"
         allow = f", or allow more with {' or '.join(more)}" if more else ""
         raise PointCloudError(
             f"depth maps that can give {num:,} points",
-            found=f"{usable:,}{seen}" if usable else "none",
+            found=f"{usable:,}{seen}{inside}" if usable else f"none{inside}",
             fix=f"Ask for fewer{allow}.",
         )
     taken = np.zeros(len(candidates.tier), bool)

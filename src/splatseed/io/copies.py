@@ -50,11 +50,7 @@ def without_copies(scene: Scene) -> Scene:
     are = agreeing(len(originals), "is a copy of another", "are copies of others")
     text = f"{counted(len(originals), 'photograph')} {are} and left out, such as {copy} of "
     finding = Finding(COPIES, f"{text}{original}.", subjects=tuple(originals))
-    return scene.replace(
-        images=tuple(image for image in scene.images if image.name not in originals),
-        absent=(*scene.absent, *originals),
-        findings=(*scene.findings, finding),
-    )
+    return scene.without(originals).replace(findings=(*scene.findings, finding))
 
 
 def _equal(images: Iterable[Image], key: Callable[[Path], Hashable]) -> list[list[Image]]:

@@ -58,8 +58,7 @@ def with_photographs(scene: Scene) -> Scene:
             f"missing: {name_some(missing, _NAMED)}",
             fix="Copy them there, with the names of the model.",
         )
-    present = tuple(image for image in scene.images if image.name not in {*missing})
-    return scene.replace(images=present, absent=(*scene.absent, *missing))
+    return scene.without(missing)
 
 
 def photograph_size(path: Path) -> Size:

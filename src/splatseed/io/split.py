@@ -34,7 +34,8 @@ def with_listed_split(scene: Scene) -> Scene:
         return scene
     findings = list(scene.findings)
     for origin, parts in _lists(scene):
-        split, unknown = _split(scene, origin, parts)
+        split, unmatched = _split(scene, origin, parts)
+        unknown = [name for name in unmatched if name not in scene.absent]
         if split is not None:
             if unknown:  # typing errors, or images that SfM lost
                 shown = ", ".join(unknown[:_SHOWN]) + (", ..." if len(unknown) > _SHOWN else "")
@@ -62,14 +63,15 @@ def _lists(scene: Scene) -> Iterator[tuple[str, list[list[str]]]]:
         (source.model_dir, ("", *MODEL_LISTS), " beside the model"),
         (source.root, ROOT_LISTS[4:], ""),
     ):
-        parts = [_read(folder / name) if folder and name else [] for name in files]
+        parts = [read_names(folder / name) if folder and name else [] for name in files]
         if any(parts):
             there = [name for name, part in zip(files, parts, strict=True) if part]
             first = f"{', '.join(there[:-1])} and " if there[1:] else ""
             yield f"{first}{there[-1]}{place}", parts
 
 
-def _read(path: Path) -> list[str]:
+def read_names(path: Path) -> list[str]:
+    """Read a list with one name per line; empty without such a file."""
     if not path.is_file():
         return []
     lines = read_bytes(path).decode("utf-8-sig", "replace").splitlines()
@@ -96,11 +98,11 @@ def _split(scene: Scene, origin: str, parts: list[list[str]]) -> tuple[Split | N
 
 def _known(names: Sequence[str], listed: Sequence[str], prefixes: Sequence[str]) -> dict[str, str]:
     """Match listed names to images: by full or folder-relative name, else by file name or stem."""
-    exact = {_composed(f"{each}{name}"): name for each in reversed(prefixes) for name in names}
-    plain = {each: _composed(each).replace("\\", "/").removeprefix("./") for each in listed}
+    exact = {composed(f"{each}{name}"): name for each in reversed(prefixes) for name in names}
+    plain = {each: composed(each).replace("\\", "/").removeprefix("./") for each in listed}
     known = {each: exact[name] for each, name in plain.items() if name in exact}
     for field in () if known else ("name", "stem"):
-        parts = {getattr(PurePosixPath(_composed(name)), field): name for name in names}
+        parts = {getattr(PurePosixPath(composed(name)), field): name for name in names}
         if len(parts) == len(names):  # unless ambiguous
             wanted = {each: getattr(PurePosixPath(name), field) for each, name in plain.items()}
             known = {each: parts[part] for each, part in wanted.items() if part in parts}
@@ -109,6 +111,6 @@ def _known(names: Sequence[str], listed: Sequence[str], prefixes: Sequence[str])
     return known
 
 
-def _composed(name: str) -> str:
+def composed(name: str) -> str:
     """Return a name with one character per umlaut, however it is written."""
     return unicodedata.normalize("NFC", name)

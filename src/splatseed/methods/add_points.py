@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from splatseed.errors import ParameterError, PointCloudError, SplatseedError
+from splatseed.io.regions import Region
 from splatseed.methods.contract import Made, Upsampler, nothing_finite, traits_of
 from splatseed.methods.registry import chooses_number, plugin_fault, source_code
 from splatseed.pointcloud import GENERATED, ORIGINAL, PointCloud
@@ -40,6 +41,7 @@ def add_points(
     ratio: float | None = None,
     num_points: int | None = None,
     budget: int | None = None,
+    region: Region | None = None,
     seed: int = 0,
     progress: Progress = silent,
     note: Note = silent_note,
@@ -47,15 +49,18 @@ def add_points(
 ) -> PointCloud:
     """Append the points of the method ``name`` to a scene's originals.
 
-    Other arguments and errors are those of ``splatseed.upsample``.
+    With a region, a method that needs points alone starts from those within it; new points may
+    still lie outside. Other arguments and errors are those of ``splatseed.upsample``.
     """
     originals = scene.points.originals
-    num_new = number_of_new(method, name, scene, ratio, num_points)
+    num_new = number_of_new(method, name, scene, ratio, num_points, region)
+    if region is not None and traits_of(method).needs == {"points"}:
+        scene = scene.with_points(originals.select(region(originals.xyz)))
     if num_new == 0 and len(originals) > 0:
         return originals
     if "points" in traits_of(method).needs and not originals.finite.any():
         raise nothing_finite(len(originals))
-    offered = {"note": note, "budget": budget, "on_stereo": on_stereo}
+    offered = {"note": note, "budget": budget, "region": region, "on_stereo": on_stereo}
     made = _call(
         name, method, (scene, num_new or 0, np.random.default_rng(seed), progress), offered
     )
@@ -86,14 +91,24 @@ def _call(name: str, method: Any, arguments: tuple[Any, ...], offered: Mapping[s
 
 
 def number_of_new(
-    method: Upsampler, name: str, scene: Scene, ratio: float | None, num_points: int | None
+    method: Upsampler,
+    name: str,
+    scene: Scene,
+    ratio: float | None,
+    num_points: int | None,
+    region: Region | None = None,
 ) -> int | None:
     """Return the number of points to add to a scene's originals; None if the method chooses it.
+
+    A ratio multiplies the originals in the region.
 
     Raises:
         ParameterError: A number is given for such a method, out of range or too large for memory.
     """
-    num_original = len(scene.points.originals)
+    originals = scene.points.originals
+    num_original = len(originals)
+    if region is not None and num_points is None:
+        num_original = int(np.count_nonzero(region(originals.xyz)))
     if not chooses_number(method):
         suggest = getattr(method, "suggested_number", None)
         if suggest is not None and not num_original:

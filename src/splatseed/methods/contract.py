@@ -56,8 +56,10 @@ class Upsampler(Protocol):
         All random numbers come from ``rng``; ``progress`` is called with stage and fraction.
         A call that has these optional parameters gets them by name: ``note``, to be called with a
         ``Finding`` for each thing that the user should know; ``budget``, the maximum number of
-        points in all, or None, for a method that chooses the number; ``on_stereo``, to be called
-        with the ``StereoResult`` of a method that compares the photographs.
+        points in all, or None, for a method that chooses the number; ``region``, which maps
+        positions to whether new points are wanted there, or None: others are dropped later;
+        ``on_stereo``, to be called with the ``StereoResult`` of a method that compares the
+        photographs.
         """
         ...
 

@@ -14,6 +14,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from splatseed.depth.settings import DepthSettings
+from splatseed.io.regions import Region
 from splatseed.methods.contract import Traits
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Note, Progress, silent_note
@@ -54,12 +55,13 @@ class Depth(DepthSettings):
         rng: np.random.Generator,
         progress: Progress,
         *,
+        region: Region | None = None,
         note: Note = silent_note,
     ) -> PointCloud:
         """Lift ``num_new`` pixels."""
         from splatseed.depth.lifting import lift
 
-        xyz, rgb, findings = lift(scene, num_new, self, rng, progress)
+        xyz, rgb, findings = lift(scene, num_new, self, rng, progress, region)
         for finding in findings:
             note(finding)
         return PointCloud(xyz, rgb)

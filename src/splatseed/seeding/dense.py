@@ -24,6 +24,7 @@ from splatseed.depth.stereo.detail import expected_spacing, fuse_at_most
 from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.depth.stereo.pipeline import compare_closer
 from splatseed.findings import Finding
+from splatseed.io.regions import Region
 from splatseed.methods import source_code
 from splatseed.photos.loading import load_views
 from splatseed.photos.sizes import factor_for_size
@@ -99,6 +100,7 @@ def fill_budget(
     rng: np.random.Generator,
     progress: Progress,
     note: Note,
+    region: Region | None = None,
 ) -> PointCloud:
     """Replace the new points of a first comparison by as many as a budget allows.
 
@@ -111,18 +113,24 @@ def fill_budget(
         rng: Draws the seed of the second comparison.
         progress: Called with the stage and the fraction done.
         note: Called with the time and memory before the second comparison, and with a shortage.
+        region: Where the new points count, and are to be.
 
     Returns:
         The new points: ``points`` themselves if they fill the budget, or nothing is confirmed that
-        could be sampled more closely.
+        could be sampled more closely. With a region, those that were measured outside of it follow.
     """
-    stereo, grid = first.stereo, first.stereo.settings.grid
+    stereo, grid, beyond = first.stereo, first.stereo.settings.grid, PointCloud.empty()
+    if region is not None:
+        stereo = stereo.within(region)
+        inside = region(points.xyz)
+        beyond = points.select(~inside & (points.source != source_code("cover")))
+        points = points.select(inside)
     num_known = len(scene.points.originals)
     room = budget - num_known
     # Cover's guesses stay as sparse as they are: more of them would confirm nothing.
     num = room - (len(points) - _count_stereo(points))
     if len(points) >= room:
-        return points
+        return PointCloud.concatenate(points, beyond)
     spacing, finest = expected_spacing(stereo, num, first.spacing)
     need = 0
     if finest:
@@ -135,16 +143,23 @@ def fill_budget(
             note(_announcement(budget, images, plan, stereo, first.seconds))
             views = _read_again(scene, images, plan.factor, stereo.views, progress)
             dense = compare_closer(stereo, views, plan.grid, int(rng.integers(1 << 32)), progress)
+            dense = dense if region is None else dense.within(region)
         scale = factor / plan.factor
         known = _originals_in_views(scene, images, dense.views)
         seeds = fuse_at_most(
             dense, num, first.spacing * scale, known, spacing * scale, progress, plan.split
         )
-        points = _drop_guesses(refill(seeds.with_source(STEREO)), room)
+        seeds = seeds.with_source(STEREO)
+        if region is None:
+            filled = refill(seeds)
+        else:  # cover guesses wrong depths where it does not know what lies beyond the region
+            filled = refill(PointCloud.concatenate(beyond, seeds))
+            filled = filled.select(region(filled.xyz))
+        points = _drop_guesses(filled, room)
         need = 0 if plan is plans[0] else plans[0].memory
     if num_known + len(points) < DENSE.nearly * budget:
         note(_shortage(scene, points, budget, need))
-    return points
+    return points if region is None else PointCloud.concatenate(points, beyond)
 
 
 def _count_stereo(points: PointCloud) -> int:

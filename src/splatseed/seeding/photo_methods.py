@@ -24,6 +24,7 @@ from splatseed.errors import (
     TaskLostError,
 )
 from splatseed.findings import Finding
+from splatseed.io.regions import Region
 from splatseed.methods import Traits, source_code
 from splatseed.photos.loading import load_views
 from splatseed.photos.sizes import factor_for_size
@@ -98,13 +99,14 @@ class Stereo(PhotographMethod):
         progress: Progress,
         *,
         budget: int | None = None,
+        region: Region | None = None,
         note: Note = silent_note,
         on_stereo: Callable[[StereoResult], None] | None = None,
     ) -> PointCloud:
         """Make the points of a scene; ``num_new`` is ignored.
 
         Without points, the scene's poses are checked first. With ``dense``, the photographs are
-        compared again where that fills the ``budget``.
+        compared again where that fills the ``budget``, with points in the region alone.
         """
         from splatseed.depth.stereo.fusion import fuse
         from splatseed.seeding.dense import Comparison, fill_budget
@@ -138,7 +140,11 @@ class Stereo(PhotographMethod):
         def refill(denser: PointCloud) -> PointCloud:
             return self.fill(scene, denser, stereo, rng, progress, silent_note)
 
-        points = fill_budget(scene, first, points, budget, refill, rng, progress, note)
+        counted_in = scene
+        if region is not None and len(triangulated):  # which are dropped outside of it
+            kept = triangulated.select(region(triangulated.xyz))
+            counted_in = scene.replace(points=kept.with_source(ORIGINAL))
+        points = fill_budget(counted_in, first, points, budget, refill, rng, progress, note, region)
         return PointCloud.concatenate(triangulated, points)
 
     def _guided(self, scene: Scene, images: Sequence[Image]) -> tuple[Scene, tuple[Finding, ...]]:

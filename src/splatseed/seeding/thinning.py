@@ -24,6 +24,7 @@ from jaxtyping import Bool, Float, Float32, Int32, Int64
 
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.frozen import read_only_view
+from splatseed.io.regions import Region
 from splatseed.methods import Upsampler, source_code
 from splatseed.photos.view import View
 from splatseed.pointcloud import ORIGINAL, PointCloud
@@ -74,13 +75,16 @@ def thin_to(
     progress: Progress,
     *,
     cell: int | None = None,
+    region: Region | None = None,
+    beyond: PointCloud | None = None,
 ) -> PointCloud:
     """Keep at most ``num`` points, originals before others of equal use.
 
     With ``num`` or more originals only originals stay: they are dense where there is detail, where
     Gaussians are needed most. But points of a scan are thinned together with them. Cover's seeds
     are guesses that must not replace a measured point, so they are made again for the points that
-    are kept, with cells of at least ``cell`` pixels (by default the method's own).
+    are kept, with cells of at least ``cell`` pixels (by default the method's own), in the region
+    if there is one, and such that they fit the points ``beyond`` it.
     """
     if len(cloud) <= num:
         return cloud
@@ -98,7 +102,9 @@ def thin_to(
     room = max(num - len(measured), round(MIN_COVER_SHARE * num))
     kept = _keep(scene, measured, num - room)
     while cell <= MAX_SIZE:
-        filled = with_cover(views, kept, cell, seed, progress).select(slice(len(kept), None))
+        known = kept if beyond is None else PointCloud.concatenate(kept, beyond)
+        filled = with_cover(views, known, cell, seed, progress).select(slice(len(known), None))
+        filled = filled if region is None else filled.select(region(filled.xyz))
         if len(filled) <= room:
             return PointCloud.concatenate(_keep(scene, measured, num - len(filled)), filled)
         cell = math.ceil(COVER_GROWTH * cell)

@@ -10,11 +10,22 @@ import dataclasses
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from splatseed.checkup.choices import UnfitPoints
 from splatseed.checkup.examination import with_fitting_points
 from splatseed.errors import ParameterError
 from splatseed.findings import Finding
-from splatseed.methods import Profile, Upsampler, add_points, check_seed, resolve, traits_of
+from splatseed.io.regions import Region, parse_region
+from splatseed.methods import (
+    Profile,
+    Upsampler,
+    add_points,
+    check_seed,
+    resolve,
+    source_code,
+    traits_of,
+)
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Note, Progress, log_note, silent, silent_note
 from splatseed.scene import Scene
@@ -49,6 +60,7 @@ def upsample(
     num_points: int | None = None,
     budget: int | str | None = None,
     cover: int | None = None,
+    region: str | Region | float | None = None,
     extra_method: Upsampler | None = None,
     seed: int = 0,
     profile: Profile = "default",
@@ -77,6 +89,11 @@ def upsample(
             pixel of one photograph. It may be below the number of originals. "auto" and "stereo"
             make up to that many where photographs confirm them (``dense=False``: only thin).
         cover: Side in pixels of the photographs' cells that get a seed if they hold no point.
+        region: Where new points are made: "x0,y0,z0,x1,y1,z1" for a box and others of
+            ``parse_region``, or a function from positions [N, 3] to booleans [N]. The originals
+            stay everywhere; ``ratio`` multiplies those within, and only new points within fill the
+            budget. Photographs are compared as without it. A number is the parameter of that name
+            of method "depth".
         extra_method: A second method, such as ``Cloud().of("scan.laz")``. Its points come before
             those of ``method``, and "auto", "stereo" and "cover" only fill the gaps between them.
         seed: Seed of all random draws; the same seed gives the same bytes on any number of threads.
@@ -113,6 +130,9 @@ def upsample(
     """
     scene = _as_scene(scene)
     check_seed(seed)
+    if isinstance(region, int | float):
+        method = resolve(method, profile, {**parameters, "region": region})[1]
+        region, parameters, profile = None, {}, "default"
     chosen = resolve(method, profile)[1]
     if "test_every" in parameters and isinstance(chosen, PhotographMethod):
         chosen = dataclasses.replace(chosen, test_every=parameters["test_every"])
@@ -121,8 +141,8 @@ def upsample(
         note(finding)
     return upsample_checked(
         scene, method, ratio=ratio, num_points=num_points, budget=budget, cover=cover,
-        extra_method=extra_method, seed=seed, profile=profile, progress=progress, note=note,
-        on_stereo=on_stereo, **parameters,
+        region=region, extra_method=extra_method, seed=seed, profile=profile, progress=progress,
+        note=note, on_stereo=on_stereo, **parameters,
     )  # fmt: skip
 
 
@@ -147,6 +167,7 @@ def upsample_checked(
     num_points: int | None = None,
     budget: int | str | None = None,
     cover: int | None = None,
+    region: str | Region | None = None,
     extra_method: Upsampler | None = None,
     seed: int = 0,
     profile: Profile = "default",
@@ -166,13 +187,15 @@ def upsample_checked(
     name, chosen = resolve(method, profile, parameters)
     scene = with_colors(scene, getattr(chosen, "test_every", 0), note, progress)
     only_default = name == DEFAULT_METHOD and ratio is None and num_points is None and cover is None
-    base, measured = scene, None
+    inside = _usable_region(region, scene, chosen)
+    base, measured, room = scene, None, limit
     if extra_method is not None:
         # Measured points come first, so that the method fills the gaps between them.
         extra_name, extra = resolve(extra_method)
         measured = add_points(scene, extra_name, extra, seed=seed, progress=progress, note=note)
         known = measured.replace(source=None) if name in FILLING else measured
         base = scene.with_points(known)
+        room = _room_beside(measured, limit, inside)
     elif only_default and limit is not None:
         originals = scene.points.originals
         originals = originals.select(originals.distinct)
@@ -180,8 +203,8 @@ def upsample_checked(
             note(_no_room(limit, len(originals)))
             return thin_to(scene, originals, limit, None, seed, progress)
     cloud = add_points(
-        base, name, chosen, ratio=ratio, num_points=num_points, budget=limit, seed=seed,
-        progress=progress, note=note, on_stereo=on_stereo,
+        base, name, chosen, ratio=ratio, num_points=num_points, budget=room, region=inside,
+        seed=seed, progress=progress, note=note, on_stereo=on_stereo,
     )  # fmt: skip
     if measured is not None:
         cloud = PointCloud.concatenate(measured, cloud.select(cloud.source != ORIGINAL))
@@ -190,9 +213,62 @@ def upsample_checked(
             scene, cloud, cell=cover, test_every=getattr(chosen, "test_every", 0), seed=seed,
             progress=progress,
         )  # fmt: skip
+    cloud, beyond = _bounded(cloud, inside, note)
     if limit is not None:
-        cloud = thin_to(scene, cloud, limit, chosen, seed, progress, cell=cover)
+        cloud = thin_to(
+            scene, cloud, limit, chosen, seed, progress, cell=cover, region=inside, beyond=beyond
+        )
     return cloud
+
+
+def _usable_region(region: str | Region | None, scene: Scene, method: Upsampler) -> Region | None:
+    """Parse a region, and check that a method that needs points alone finds some there."""
+    region = parse_region(region) if isinstance(region, str) else region
+    if region is not None and traits_of(method).needs == {"points"}:
+        _check_reached(region, scene.points.originals, "points of the scene")
+    return region
+
+
+def _room_beside(measured: PointCloud, limit: int | None, region: Region | None) -> int | None:
+    """Return a limit that points measured outside of a region, to be left out, do not fill."""
+    if limit is None or region is None:
+        return limit
+    new = measured.select(measured.source != ORIGINAL)
+    return limit + int(np.count_nonzero(~region(new.xyz)))
+
+
+def _bounded(
+    cloud: PointCloud, region: Region | None, note: Note
+) -> tuple[PointCloud, PointCloud | None]:
+    """Leave out new points outside of a region; also return those of them that were measured."""
+    if region is None:
+        return cloud, None
+    own, inside = cloud.source == ORIGINAL, region(cloud.xyz)
+    new = int(np.count_nonzero(~own))
+    if new:
+        _check_reached(region, cloud.select(~own), "new points")
+    text = (
+        f"{np.count_nonzero(inside & ~own):,} of {counted(new, 'new point')} are in the region, "
+        f"the others are left out; {counted(cloud.num_original, 'point')} of the scene stay, "
+        f"{np.count_nonzero(inside & own):,} of them in the region."
+    )
+    note(Finding("seeds-of-region", text, "info"))
+    beyond = ~inside & ~own & (cloud.source != source_code("cover"))
+    return cloud.select(inside | own), cloud.select(beyond)
+
+
+def _check_reached(region: Region, points: PointCloud, what: str) -> None:
+    """Raise a ``ParameterError`` if none of some points lies in a region."""
+    xyz = points.xyz[points.finite]
+    if region(xyz).any():
+        return
+    ends = (end(xyz, axis=0) for end in (np.min, np.max)) if len(xyz) else ()
+    lie = " to ".join(" ".join(f"{value:.4g}" for value in end) for end in ends)
+    raise ParameterError(
+        f"`region` to hold {what}",
+        found=f"none of {len(xyz):,}{f', which lie from {lie}' if lie else ''}",
+        fix="Choose a larger region, in the coordinates of splatseed info SCENE.",
+    )
 
 
 def _as_scene(scene: Scene | PointCloud) -> Scene:

@@ -11,7 +11,7 @@ median shifts of blocks between frames, by phase correlation (Kuglin and Hines 1
 from __future__ import annotations
 
 import re
-from collections.abc import Container, Iterable
+from collections.abc import Container, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.io.exclusion import matching_names
 from splatseed.io.files import VIDEO_SUFFIXES, StrPath, files_below
 from splatseed.io.image_folders import link_folders
 from splatseed.io.mask_files import masks_among
@@ -59,6 +60,8 @@ _FOREIGN_SUFFIXES = frozenset(
      ".orf", ".rw2"}
 )  # fmt: skip
 _GREY = "of 16-bit or floating-point grey, as depth maps are"
+EXCLUDED = "that `exclude` names"
+"""Why images are left out that the user chose."""
 _FOREIGN = "of an unsupported format"
 _MASK = "named as masks of others are"
 _MAP = "of grey, named as maps of depth or confidence are"
@@ -77,13 +80,15 @@ _MIN_FRAMES = 3
 """Fewest frames of a scene."""
 
 
-def find_photos(image_dir: StrPath) -> tuple[dict[str, Photo], dict[str, list[str]]]:
+def find_photos(
+    image_dir: StrPath, exclude: Sequence[str] = ()
+) -> tuple[dict[str, Photo], dict[str, list[str]]]:
     """Find the photographs of a folder and its subfolders, at least two.
 
     Skipped are hidden files, masks, reduced copies in ``images_2`` and so on, depth maps (16-bit or
     float grey; next to colour photographs also 8-bit grey with the name of a depth or confidence
-    map), textures and thumbnails in an export of 3D Scanner App, and unsupported formats such as
-    HEIC or raw.
+    map), textures and thumbnails in an export of 3D Scanner App, unsupported formats such as HEIC
+    or raw, and those that ``exclude`` names, as for ``io.exclusion.exclude``.
 
     Returns:
         The photographs by name (relative path), sorted; and the names of skipped images by reason.
@@ -106,6 +111,8 @@ def find_photos(image_dir: StrPath) -> tuple[dict[str, Photo], dict[str, list[st
         sorted(path.as_posix() for path in files if path.suffix.lower() in suffixes)
         for suffixes in (_SUFFIXES, _FOREIGN_SUFFIXES)
     )
+    excluded = matching_names([*names, *foreign], exclude)
+    names, foreign = ([name for name in each if name not in excluded] for each in (names, foreign))
     masks = masks_among(names)
     names = [name for name in names if name not in masks]
     copies = _reduced_copies(names)
@@ -128,6 +135,7 @@ def find_photos(image_dir: StrPath) -> tuple[dict[str, Photo], dict[str, list[st
         (_COPY, sorted(copies)),
         (_FOREIGN, foreign),
         (_MASK, sorted(masks)),
+        (EXCLUDED, sorted(excluded)),
     )
     left_out = {reason: names for reason, names in kinds if names}
     if len(photos) < 2:

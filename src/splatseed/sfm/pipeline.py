@@ -69,7 +69,7 @@ from splatseed.sfm.panoramas import (
     rigs_of,
     split_of_faces,
 )
-from splatseed.sfm.photos import find_photos, match_poses
+from splatseed.sfm.photos import EXCLUDED, find_photos, match_poses
 from splatseed.sfm.refinement import Refinement, refine, unrefined_finding
 from splatseed.sfm.work_folder import WorkFolder, resumable_work, work_key
 from splatseed.text import counted
@@ -116,6 +116,7 @@ def reconstruct(
     poses_from: Scene | None = None,
     refine_poses: bool = False,
     test_names: Collection[str] = (),
+    exclude: Sequence[str] = (),
     masks: Masks | None = None,
     partial: bool = False,
     keep: bool = True,
@@ -154,6 +155,7 @@ def reconstruct(
             error by less than 0.1 px.
         test_names: Posed photographs, by name, whose poses are refined with the others but which
             neither contribute points nor appear in the scene, such as test views.
+        exclude: Photographs to leave out: names or patterns, as for ``io.exclusion.exclude``.
         masks: Masked pixels get no features; the scene gets undistorted masks.
         partial: Accept a model of fewer than half of the photographs.
         keep: On failure, keep features, matches and models in ``OUTPUT_sfm``, and resume from
@@ -177,7 +179,7 @@ def reconstruct(
         colmap.check_choice("camera_model", camera_model, tuple(CAMERA_MODELS))
     require("pycolmap")
     images = Path(image_dir).absolute()
-    photos, left_out = find_photos(images)
+    photos, left_out = find_photos(images, exclude)
     poses = None if poses_from is None else match_poses(photos, poses_from, images)
     whole, found = find_panoramas(images, photos, panoramas if poses is None else "none")
     check_mask_below(mask_below, whole)
@@ -232,6 +234,7 @@ def reconstruct(
             "job": "reconstruct" if poses is None else "triangulate",
             "version": version_of("splatseed"),
             "settings": asdict(settings),
+            "exclude": left_out.get(EXCLUDED, []),
             "report": {k: v for k, v in asdict(report).items() if k not in {"path", "poses"}},
         }
         write_json(staging / MANIFEST, manifest)

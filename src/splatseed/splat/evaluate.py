@@ -31,6 +31,7 @@ from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.findings import Finding
 from splatseed.io import load_scene
 from splatseed.io.copies import COPIES
+from splatseed.io.exclusion import EXCLUDED, excluded_finding, matching_names
 from splatseed.io.masks import TRANSPARENT, with_masks
 from splatseed.io.photograph import photographs_digest
 from splatseed.io.photograph_checks import with_photographs
@@ -39,7 +40,7 @@ from splatseed.photos.loading import load_views
 from splatseed.photos.sizes import default_factor
 from splatseed.photos.view import View, camera_views
 from splatseed.progress import Progress, silent
-from splatseed.scene import BLACK, Color, Scene
+from splatseed.scene import BLACK, Color, Image, Scene
 from splatseed.scores import NOT_REQUESTED, EvalResult, ViewScore
 from splatseed.splat._kernels import WINDOW
 from splatseed.splat.background import WHITE, background_of
@@ -187,6 +188,7 @@ def load_model(
     test_every: int = 8,
     transform: str | None = None,
     masks: str | None = None,
+    exclude: Sequence[str] = (),
     trained_on: str | None = None,
     near_plane: float | None = None,
     background: str | None = None,
@@ -204,6 +206,7 @@ def load_model(
         transform: From the scene's to the model's frame, as for ``find_transform``; by default they
             must be the same.
         masks: The masks, as for ``io.masks.with_masks``.
+        exclude: Test views to leave out: names or patterns, as for ``io.exclusion.exclude``.
         trained_on: The ``photographs_digest`` of the run; if it equals the scene's, the frame is
             known to be right and not checked.
         near_plane: The run's, in the model's units; by default computed from the scene.
@@ -228,7 +231,7 @@ def load_model(
     scene = with_masks(scene, masks)
     known = background_of(path, background, findings.append)
     scene = scene.replace(background=known or BLACK)
-    reported = (TRANSPARENT, COPIES, WRONG_POSES)
+    reported = (TRANSPARENT, COPIES, WRONG_POSES, EXCLUDED)
     findings += [each for each in scene.findings if each.kind in reported]
     if scene.images:
         scene = _with_test_photographs(scene, test_every)
@@ -244,6 +247,8 @@ def load_model(
             found=f"{len(scene.images)}",
             fix="Name the scene with its cameras and photographs.",
         )
+    test, excluded = _without_excluded(scene, test, exclude)
+    findings += excluded
     factor = data_factor or default_factor(scene.images)
     views = load_views(
         scene,
@@ -277,6 +282,22 @@ def load_model(
     if known is None:
         findings += _better_on_white(renderer, scene, views, factor)
     return TrainedModel(gaussians, views, render, scene, factor, tuple(findings))
+
+
+def _without_excluded(
+    scene: Scene, test: Sequence[Image], patterns: Sequence[str]
+) -> tuple[tuple[Image, ...], list[Finding]]:
+    """Leave test views out; the scene keeps them, by which a run's scene is recognised."""
+    names = matching_names([*(image.name for image in scene.images), *scene.absent], patterns)
+    left = tuple(image for image in test if image.name not in names)
+    if not left:
+        raise ParameterError(
+            "`exclude` to leave some test views",
+            found=f"patterns that match all {len(test):,}",
+            fix="Name fewer.",
+        )
+    gone = [image.name for image in test if image.name in names]
+    return left, [excluded_finding(gone)] if gone else []
 
 
 def _better_on_white(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -20,6 +20,7 @@ from jaxtyping import Float32
 
 from splatseed.errors import ParameterError
 from splatseed.io import load_scene
+from splatseed.io.exclusion import exclude
 from splatseed.io.files import StrPath, read_text
 from splatseed.io.masks import with_masks
 from splatseed.io.staging import reserved
@@ -32,7 +33,7 @@ from splatseed.scene import MIN_HELD_OUT, Image, Scene
 from splatseed.scores import EvalResult
 from splatseed.seeding.budget import in_rho, median_pixels, median_size, parse_budget
 from splatseed.settings import change_settings
-from splatseed.training.config import near_plane_of
+from splatseed.training.config import excluded_names, near_plane_of
 from splatseed.training.folder import RunFolder, config_of, model_file
 from splatseed.training.request import EvaluateRequest, TrainRequest
 from splatseed.training.settings import BUDGET, MIN_GAUSSIANS, TrainSettings
@@ -135,7 +136,8 @@ def train(
             ``seed``, ``test_every``, ``backend``, ``start``, ``exposure``, ``seeding``, ...; and of
             ``TrainRequest``: ``budget`` (a number, or "0.25rho" for a quarter of a photograph's
             pixels), ``long_side`` instead of ``data_factor``, ``masks`` (a folder, "none",
-            "inverted", "alpha"), ``refine_poses``, ``resume``, ``overwrite``, ``tensorboard``.
+            "inverted", "alpha"), ``exclude`` (a list of names, of patterns such as "IMG_00*", or of
+            .txt files with them), ``refine_poses``, ``resume``, ``overwrite``, ``tensorboard``.
 
     Raises:
         ParameterError: An option is unknown or out of range, or differs from the resumed run's.
@@ -176,7 +178,10 @@ def prepare_training(
         points_alone = "seeding" in request.named and settings.seeding == "scene"
         points_alone &= not request.refine_poses and not settings.start
         scene = load_scene(scene, require_points=points_alone)
-    scene = with_masks(scene, request.masks)
+    patterns: Sequence[str] = request.exclude
+    if resumed is not None and not patterns:
+        patterns = excluded_names(resumed.read_config(), scene)
+    scene = with_masks(exclude(scene, patterns), request.masks)
     for finding in scene.findings:
         note(finding)
     if scene.listed is not None:
@@ -215,9 +220,10 @@ def evaluate(
         **options: Fields of ``EvaluateRequest``: ``data_factor`` and ``test_every``, by default as
             the run was trained; ``transform`` from the scene's frame to the model's (a file,
             "gsplat", "flipped", "turned", or "none" to skip the check that they agree); ``masks``
-            (a folder, "none", "inverted", "alpha"); ``background`` ("black", "white" or "R,G,B", by
-            default what the model's trainer recorded, else black); ``lpips_weights``, a file,
-            without which, here or in PyTorch's cache, LPIPS is None; ``backend``.
+            (a folder, "none", "inverted", "alpha"); ``exclude``, test views to leave out;
+            ``background`` ("black", "white" or "R,G,B", by default what the model's trainer
+            recorded, else black); ``lpips_weights``, a file, without which, here or in PyTorch's
+            cache, LPIPS is None; ``backend``.
 
     Returns:
         Means over the test views, as attributes (``psnr`` in dB, ``cc_psnr``, ``covisible_psnr``,

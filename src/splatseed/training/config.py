@@ -9,10 +9,12 @@ import dataclasses
 import math
 import platform
 from collections.abc import Collection, Mapping
+from types import MappingProxyType
 from typing import Any
 
 from splatseed.checkup.wrong_poses import leave_out
 from splatseed.errors import ParameterError, SceneFormatError
+from splatseed.io.exclusion import exclude
 from splatseed.io.masks import mask_choice, masks_digest, with_masks
 from splatseed.io.photograph import photographs_digest
 from splatseed.io.staging import write_json
@@ -34,12 +36,12 @@ def make_config(
     frame: TrainingFrame | None = None,
     *,
     refine_poses: bool = False,
-    dropped: Collection[str] = (),
+    left_out: Mapping[str, Collection[str]] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Return the content of config.json.
 
-    ``initial`` are the facts of the seeds or of the start, ``dropped`` the images that the run
-    leaves out for their poses.
+    ``initial`` are the facts of the seeds or of the start. ``left_out`` are images that the run
+    leaves out: "dropped" for their poses, "excluded" before, by patterns "exclude" or otherwise.
     """
     source = scene.source
     points = None if refine_poses else source.points_path
@@ -55,7 +57,7 @@ def make_config(
         "seeds": dict(initial),
         "photographs": photographs_digest(scene),
         "split": _names_of_parts(scene, settings),
-        "dropped": sorted(dropped),
+        **{name: sorted(names) for name, names in left_out.items()},
         "versions": {
             "python": platform.python_version(),
             **{name: version_of(name) for name in ("torch", "gsplat", "numba", "numpy")},
@@ -126,10 +128,16 @@ def has_run_poses(config: Mapping[str, Any], scene: Scene) -> bool:
 
 
 def without_dropped(scene: Scene, config: Mapping[str, Any]) -> Scene:
-    """Return a scene without the images that a run left out for their poses, and say so in it."""
-    dropped = config.get("dropped")
+    """Return a scene without the images that a run left out, and report them in it."""
+    dropped, scene = config.get("dropped"), exclude(scene, excluded_names(config, scene))
     scene, findings = leave_out(scene, dropped if isinstance(dropped, list) else ())
     return scene.replace(findings=(*scene.findings, *findings)) if findings else scene
+
+
+def excluded_names(config: Mapping[str, Any], scene: Scene) -> list[str]:
+    """Return the images of a scene that a run left out from the beginning."""
+    names = config.get("excluded")
+    return [name for name in names if name in scene] if isinstance(names, list) else []
 
 
 def check_same_input(folder: RunFolder, config: Mapping[str, Any], now: Mapping[str, Any]) -> None:

@@ -96,7 +96,7 @@ class Evaluation:
     def load(self, progress: Progress = silent) -> TrainedModel:
         """Read the model and the photographs of its test views.
 
-        Photographs that the run left out for their poses are no test views.
+        Photographs that the run left out are no test views.
 
         Raises:
             ParameterError: The run held nothing out, and the scene lists no tests.
@@ -119,6 +119,7 @@ class Evaluation:
             test_every=self.test_every,
             transform=self.request.transform,
             masks=self.request.masks,
+            exclude=self.request.exclude,
             trained_on=self.config.get("photographs"),
             near_plane=near_plane_of(self.config),
             background=self.request.background or ("black" if self.config else None),

@@ -21,6 +21,7 @@ from splatseed.checkup.wrong_poses import leave_out, without_wrong_poses
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.findings import Finding
 from splatseed.io import load_scene
+from splatseed.io.exclusion import exclude
 from splatseed.io.files import StrPath
 from splatseed.io.photograph_checks import check_sizes, with_photographs
 from splatseed.io.seeds import was_upsampled
@@ -110,6 +111,8 @@ def prepare_run(
         ReconstructionError: Poses cannot be refined.
         MissingDependencyError: TensorBoard or pycolmap is needed and absent.
     """
+    scene = exclude(scene, options.exclude)
+    excluded = scene.absent
     scene = _photographed(scene)  # before the folder is checked, which may be a bare cloud's
     scene, setup = _set_up(scene, Path(output), settings, options, named, note, progress)
     settings, folder = setup.settings, setup.folder
@@ -126,7 +129,8 @@ def prepare_run(
     initial = _initial(scene, setup)
     frame = initial.frame(scene, settings)
     dropped = [image.name for image in posed.images if image.name not in checked]
-    config = _checked_config(scene, initial, frame, setup, dropped)
+    left_out = {"exclude": options.exclude, "excluded": excluded, "dropped": dropped}
+    config = _checked_config(scene, initial, frame, setup, left_out)
     views = load_split(
         scene,
         data_factor=settings.factor,
@@ -267,7 +271,7 @@ def _checked_config(
     initial: _Seeds | _Start,
     frame: TrainingFrame,
     setup: _Setup,
-    dropped: Collection[str],
+    left_out: Mapping[str, Collection[str]],
 ) -> dict[str, Any]:
     """Return the content of config.json, once it fits the memory and the run to resume."""
     for stray in stray_findings(frame.strays):
@@ -276,7 +280,7 @@ def _checked_config(
     check_fits(facts["count"], device)
     config = make_config(
         scene, facts, setup.settings, device_name(device), frame,
-        refine_poses=setup.refine_poses, dropped=dropped,
+        refine_poses=setup.refine_poses, left_out=left_out,
     )  # fmt: skip
     if setup.earlier:
         check_same_input(setup.folder, setup.earlier, config)

@@ -20,6 +20,11 @@ from splatseed.training.settings import Backend, TrainSettings
 
 MaskChoice = Annotated[str | None, tyro.conf.arg(metavar="DIR|none|inverted[:DIR]|alpha")]
 """The masks to use: see ``io.masks.with_masks``."""
+ExcludeChoice = Annotated[
+    tyro.conf.UseAppendAction[tuple[str, ...]],
+    tyro.conf.arg(metavar="NAME|PATTERN|FILE", help_behavior_hint="(repeatable)"),
+]
+"""The photographs to leave out: see ``io.exclusion.exclude``."""
 DEFAULTS = TrainSettings(strategy="auto", seeding="advised")
 """The settings of a new run of ``train``, those that score best; a resumed run has its own.
 
@@ -30,11 +35,13 @@ scene's points: plans of ``bench`` start from it, to compare methods as in 3DGS.
 
 @dataclass(frozen=True)
 class PrepareOptions:
-    """What to do with a run's folder and its poses, before training."""
+    """What to do with a run's folder, its poses and photographs, before training."""
 
     refine_poses: bool = False
     """First refine a phone's or SLAM's poses, unless that gains nothing. Points are triangulated
     there in place of those with tracks; others, such as LiDAR's, stay."""
+    exclude: ExcludeChoice = ()
+    """Photographs to leave out: a name, a pattern such as 'IMG_00*', or a .txt file of these."""
     resume: bool = False
     """Resume the run in the output folder, with its own settings; start one if there is none."""
     tensorboard: bool = False
@@ -109,6 +116,9 @@ class EvaluateRequest:
     default the run's, else the folder masks beside the photographs. Transparent pixels are empty
     space around an object that is cut out, and do not count elsewhere; none: always empty, alpha:
     never."""
+    exclude: ExcludeChoice = ()
+    """Leave out test views, in addition to what the run left out: a name, a pattern such as
+    'IMG_00*', or a .txt file with one per line."""
     background: Annotated[str | None, tyro.conf.arg(metavar="black|white|R,G,B")] = None
     """The background of renders, over which transparent pixels of photographs are composited, too;
     by default what the trainer recorded beside the model (graphdeco's cfg_args, nerfstudio's

@@ -23,6 +23,7 @@ from splatseed.errors import SceneFormatError
 from splatseed.findings import Finding
 from splatseed.io.camera_records import OPENCV_FROM_OPENGL
 from splatseed.io.files import read_bytes, translate_errors
+from splatseed.io.regions import Region, turned_box
 from splatseed.photos.view import View
 from splatseed.photos.visibility import points_in_image
 from splatseed.projection import camera_centers
@@ -30,7 +31,6 @@ from splatseed.sampling import evenly_spaced
 from splatseed.scene import Color
 from splatseed.similarity import Similarity
 from splatseed.splat.gaussians import Gaussians
-from splatseed.splat.selection import Region, turned_box
 from splatseed.text import agreeing, counted
 from splatseed.viewer.models import pinhole_view
 

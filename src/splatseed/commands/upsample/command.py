@@ -19,6 +19,7 @@ from splatseed.findings import Finding
 from splatseed.io import load_originals, write_scene
 from splatseed.io.clouds import open_cloud
 from splatseed.io.colmap_model import scene_root
+from splatseed.io.exclusion import exclude
 from splatseed.io.load import with_depths_in, with_own_depths
 from splatseed.io.masks import with_masks
 from splatseed.io.nerfstudio import read_cloud_transform
@@ -30,6 +31,7 @@ from splatseed.io.origin import (
     translated,
     write_offset,
 )
+from splatseed.io.regions import Region, parse_region
 from splatseed.io.staging import add_files, check_output, write_json
 from splatseed.methods import Upsampler, configure, number_of_new, planned_size, traits_of
 from splatseed.photos.camera_check import stray_cameras
@@ -61,6 +63,7 @@ def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options, methods = parse(arguments)
     check(options)
+    region = None if options.region is None else parse_region(options.region)
     planned_size(1, options.ratio, None if options.ratio is None else options.num_points)
     inputs = (options.scene, options.depth_maps, options.cloud_transform, *options.cloud_files)
     protect = [path for path in inputs if path is not None]
@@ -72,10 +75,12 @@ def run(arguments: list[str]) -> None:
     clouds: Any = methods[CLOUD]
     for file in options.cloud_files:
         open_cloud(file, clouds.columns)  # reads the header, so that a bad file fails first
-    _upsample(options, methods, arguments)
+    _upsample(options, methods, region, arguments)
 
 
-def _upsample(options: Options, methods: dict[str, Any], arguments: list[str]) -> None:
+def _upsample(
+    options: Options, methods: dict[str, Any], region: Region | None, arguments: list[str]
+) -> None:
     from splatseed.seeding.upsampling import upsample_checked
 
     notes: list[Finding] = []
@@ -93,7 +98,7 @@ def _upsample(options: Options, methods: dict[str, Any], arguments: list[str]) -
             notes += findings
         scene = _checked_up(options, scene, methods[options.method], note, clock)
         if options.recenter:
-            scene = _recentered(scene, note)
+            scene, region = _recentered(scene, region, note)
         if options.method == DEFAULT_METHOD:  # it needs photographs
             options = replace(options, method=str(method_for(scene, note=note)))
         cloud, extra_method = None, None
@@ -104,7 +109,8 @@ def _upsample(options: Options, methods: dict[str, Any], arguments: list[str]) -
             if options.method != CLOUD:
                 extra_method = replace(cloud.method, alone=False)
         method, count = methods[options.method], len(scene.points)
-        new = number_of_new(method, options.method, scene, options.ratio, options.num_points)
+        how_many = options.ratio, options.num_points, region
+        new = number_of_new(method, options.method, scene, *how_many)
         total = None if new is None else count + new
         limit = None if options.budget is None else points_within(scene, options.budget)
     number = report.number_summary(total, limit, covered=options.cover_cell is not None)
@@ -114,7 +120,7 @@ def _upsample(options: Options, methods: dict[str, Any], arguments: list[str]) -
     with stage_display(clock):
         seeds = upsample_checked(
             scene, method, num_points=total, budget=options.budget, cover=options.cover_cell,
-            extra_method=extra_method, seed=options.seed, progress=clock,
+            region=region, extra_method=extra_method, seed=options.seed, progress=clock,
             note=note,
         )  # fmt: skip
         seeded = scene.replace(points=seeds, findings=(*scene.findings, *notes))
@@ -165,13 +171,17 @@ def _checked_up(
     return scene
 
 
-def _recentered(scene: Scene, note: Note) -> Scene:
+def _recentered(scene: Scene, region: Region | None, note: Note) -> tuple[Scene, Region | None]:
+    before = scene.offset
     scene = translated(scene, middle_of_cameras(scene))
+    shift, inside = scene.offset - before, region
+    if inside is not None:
+        region = lambda xyz: inside(xyz + shift)  # noqa: E731  (one expression)
     where = f"written around {format_offset(scene.offset)}, as {RECENTER} has it."
     unchanged = "around 0 already: --recenter changes nothing."
     text = f"The scene is {where if scene.offset.any() else unchanged}"
     note(Finding("recentered", text, "info"))
-    return scene
+    return scene, region
 
 
 def _refined(
@@ -209,7 +219,8 @@ def _write_extras(
 def _read(options: Options, method: Upsampler) -> Scene:
     """Read the scene's original points, and its depth maps if the method or an option uses them."""
     needed = "points" in traits_of(method).needs and not options.refine_poses  # it makes points
-    scene = with_masks(load_originals(options.scene, require_points=needed), options.masks)
+    scene = exclude(load_originals(options.scene, require_points=needed), options.exclude)
+    scene = with_masks(scene, options.masks)
     if options.depth_maps is not None:
         kind, scale = options.depth_kind, options.depth_scale
         return with_depths_in(scene, options.depth_maps, kind=kind, scale=scale)

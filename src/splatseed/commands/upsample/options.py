@@ -14,11 +14,12 @@ import tyro
 from splatseed.checkup.choices import UnfitPoints
 from splatseed.commands.options import check_minimum, parse_options, parse_some, refuse
 from splatseed.depthmap import DepthKind
+from splatseed.io.regions import REGION_FORM
 from splatseed.methods import METHODS, Profile, Upsampler, configure
 from splatseed.runtime.memory import parse_bytes
 from splatseed.seeding.advice import DEFAULT_METHOD
 from splatseed.text import quoted
-from splatseed.training.request import MaskChoice
+from splatseed.training.request import ExcludeChoice, MaskChoice
 
 POINT_FILES = (".ply", ".las", ".laz", ".e57", ".pcd", ".xyz", ".pts", ".npz", ".bin", ".txt")
 """Suffixes that suggest the user wants a point file, not a scene folder."""
@@ -52,6 +53,10 @@ class Options:
     cover_cell: Annotated[int | None, tyro.conf.arg(name="cover")] = None
     """Add a seed to every photograph cell without a point; the value is the cell's side in pixels.
     Methods auto and cover have --auto.cell and --cover.cell instead."""
+    region: Annotated[str | None, tyro.conf.arg(metavar=REGION_FORM)] = None
+    """Make new points in a region alone: a box by its minimum and maximum corners, a sphere, or the
+    matrix of a turned box, as numbers or a file. The scene's own points stay everywhere; write
+    --region=-1,... if the first number is negative."""
     seed: int = 0
     """Random seed: same seed, same bytes."""
     profile: Profile = "default"
@@ -78,6 +83,8 @@ class Options:
     drop_wrong_poses: bool = False
     """Leave out single photographs whose poses do not fit the points that other photographs
     confirm."""
+    exclude: ExcludeChoice = ()
+    """Photographs to leave out: a name, a pattern such as 'IMG_00*', or a .txt file of these."""
     cloud_files: Annotated[
         tyro.conf.UseAppendAction[tuple[Path, ...]],
         tyro.conf.arg(name="cloud", metavar="FILE", help_behavior_hint="(repeatable)"),

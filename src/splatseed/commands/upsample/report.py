@@ -83,6 +83,7 @@ def provenance(
         "method": options.method,
         "profile": options.profile,
         "parameters": parameters_of(method),
+        "exclude": options.exclude,
         "listed_tests_held_out": scene.listed is not None,
         "cloud": cloud if options.cloud_files else None,
         "depth": full(options.depth_maps),
@@ -90,6 +91,7 @@ def provenance(
         "num_points_asked": options.num_points,
         "budget": options.budget,
         "cover": options.cover_cell,
+        "region": options.region,
         "covered": None if coverage is None else {"cell": CELL, **coverage._asdict()},
         "seed": options.seed,
     }

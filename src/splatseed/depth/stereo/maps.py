@@ -8,13 +8,14 @@ other pixels is NaN and their confidence 0.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int64, UInt8
 
 from splatseed.camera import Camera
+from splatseed.io.regions import Region
 from splatseed.photos.view import View
 from splatseed.pointcloud import PointCloud
 from splatseed.projection import pixel_centers, scaled
@@ -124,6 +125,19 @@ class StereoResult:
         num_sources = int((self.sources[i] >= 0).sum())
         needed = max(1, min(self.settings.min_agreeing, num_sources))
         return np.asarray(np.bitwise_count(self.agreeing[i]) >= needed)
+
+    def within(self, region: Region) -> StereoResult:
+        """Return the result without the depths outside of a region, as if none confirmed them."""
+        kept = []
+        for i, view in enumerate(self.views):
+            row, column = np.nonzero(self.confirmed(i))
+            uv = (np.stack([column, row], axis=1) + 0.5) * self.settings.grid
+            inside = region(view.camera.unproject(uv, 1.0 / self.planes[i][0, row, column]))
+            agreeing = np.zeros_like(self.agreeing[i])
+            at = row[inside], column[inside]
+            agreeing[at] = self.agreeing[i][at]
+            kept.append(agreeing)
+        return replace(self, agreeing=kept)
 
     def map(self, i: int) -> StereoMap:
         """The map of view i."""

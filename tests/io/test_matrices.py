@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from splatseed.errors import ParameterError, SceneNotFoundError
+from splatseed.io.matrices import parse_matrix, parse_similarity
 from splatseed.similarity import Similarity
 from splatseed.splat.gaussians import Gaussians
-from splatseed.splat.matrices import parse_matrix, parse_similarity
 from splatseed.splat.model_frame import transform_gaussians, view_in_model_frame
 
 TURN = Rotation.from_euler("xyz", [20, -50, 130], degrees=True).as_matrix()
