@@ -92,16 +92,16 @@ def _upsample(
         if options.gaussians is not None:  # photographs bound their sizes
             photo_methods.photographed(scene, without="leave out --gaussians")
         if options.refine_poses:
-            own = int(scene.points.distinct.sum())
+            given = scene.points
             scene, kept, findings = _refined(options, scene, methods[options.method], note, clock)
-            points_in = report.triangulated(own, kept, len(scene.points))
+            points_in = report.triangulated(int(given.distinct.sum()), kept, len(scene.points))
             notes += findings
         scene = _checked_up(options, scene, methods[options.method], note, clock)
         if options.recenter:
             scene, region = _recentered(scene, region, note)
         if options.method == DEFAULT_METHOD:  # it needs photographs
             options = replace(options, method=str(method_for(scene, note=note)))
-        cloud, extra_method = None, None
+        cloud = extra_method = None
         if options.cloud_files:
             cloud = load_cloud(options, scene, methods[CLOUD], clock)
             scene, methods = cloud.scene, {**methods, CLOUD: cloud.method}
@@ -109,8 +109,9 @@ def _upsample(
             if options.method != CLOUD:
                 extra_method = replace(cloud.method, alone=False)
         method, count = methods[options.method], len(scene.points)
-        how_many = options.ratio, options.num_points, region
-        new = number_of_new(method, options.method, scene, *how_many)
+        new = number_of_new(
+            method, options.method, scene, options.ratio, options.num_points, region
+        )
         total = None if new is None else count + new
         limit = None if options.budget is None else points_within(scene, options.budget)
     number = report.number_summary(total, limit, covered=options.cover_cell is not None)
@@ -138,8 +139,8 @@ def _upsample(
         _write_extras(options, scene, seeded, method, clock)
         seconds = clock.seconds()
     if options.gaussians is not None:
-        text = f"The initial Gaussians are in {visible(options.gaussians)}."
-        notes.append(Finding("gaussians-written", text, "info"))
+        where = visible(options.gaussians)
+        notes.append(Finding("gaussians-written", f"The initial Gaussians are in {where}.", "info"))
     origins = report.origin_counts(seeds, options.method, written.num_points)
     report.summarise(options, scene, points_in, origins, written, seconds, quality, arguments)
     print_note(*notes)
