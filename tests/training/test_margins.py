@@ -10,14 +10,7 @@ from splatseed.photos.loading import load_views
 from splatseed.splat.from_seeds import initial_gaussians
 from splatseed.splat.rendering import ModelRenderer
 from splatseed.splat.training_frame import training_frame
-from splatseed.training.margins import (
-    MAX_PHOTOGRAPHS,
-    NEAR,
-    SHARE,
-    continued,
-    has_margins,
-    with_margins,
-)
+from splatseed.training.margins import NEAR, SHARE, continued, has_margins, with_margins
 from splatseed.training.settings import TrainSettings
 
 
@@ -87,11 +80,12 @@ def _wider(view):
     return dataclasses.replace(view, camera=camera, photograph=np.empty((0, 0, 3), np.uint8))
 
 
-def test_few_whole_photographs_alone_have_margins(room):
-    views = load_views(room, room.images)[:MAX_PHOTOGRAPHS]
+def test_models_that_grow_on_whole_photographs_have_margins(room):
+    views = load_views(room, room.images)
     settings = TrainSettings()
-    assert has_margins(settings, views[:3])
-    assert not has_margins(dataclasses.replace(settings, start="model.ply"), views[:3])
-    assert not has_margins(dataclasses.replace(settings, strategy="default-3dgs"), views[:3])
-    assert not has_margins(dataclasses.replace(settings, strategy="none"), views[:3])
-    assert not has_margins(settings, [*views] * 2)
+    assert has_margins(settings, views)
+    assert not has_margins(dataclasses.replace(settings, start="model.ply"), views)
+    assert not has_margins(dataclasses.replace(settings, strategy="default-3dgs"), views)
+    assert not has_margins(dataclasses.replace(settings, strategy="none"), views)
+    cut_out = dataclasses.replace(views[0], opacity=views[0].photograph[..., 0])
+    assert not has_margins(settings, [cut_out, *views])

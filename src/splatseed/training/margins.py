@@ -1,10 +1,10 @@
 """Margins: what lies just past the edges of the photographs, continued from what they show.
 
-No photograph trains what it does not see, so that a model of few photographs ends in black at their
-frames. After the last step each training view is rendered, and its colours and inverse depths are
-continued beyond its frame, the smoother the farther out. A Gaussian is added for every few pixels
-there, unless it lies within another frame, or nearer to it. Promise: what is within a frame is left
-alone but for Gaussians that reach across its edge; the same model gives the same bytes.
+No photograph trains what it does not see, so that a model ends in black at their frames. After the
+last step each training view is rendered, and its colours and inverse depths are continued beyond
+its frame, the smoother the farther out. A Gaussian is added for every few pixels there, unless it
+lies within another frame, or nearer to it. Promise: what is within a frame is left alone but for
+Gaussians that reach across its edge; the same model gives the same bytes.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from jaxtyping import Bool, Float, Float32, Float64
 from splatseed.camera import Camera
 from splatseed.photos.view import NO_PIXELS, View
 from splatseed.projection import scaled
-from splatseed.seeding.few_photographs import MAX_PHOTOGRAPHS
 from splatseed.splat.gaussians import SH_C0, Gaussians
 from splatseed.splat.rendering import ModelRenderer
 from splatseed.splat.training_frame import TrainingFrame
@@ -32,8 +31,8 @@ WIDTH = 0.4
 """Width of the margin on each side, in longer sides of the frame."""
 STEP = 4
 """Minimum distance of Gaussians, in pixels of the rendered view."""
-SHARE = 0.1
-"""Maximum number of Gaussians of margins, as a fraction of the cap."""
+SHARE = 0.025
+"""Maximum number of Gaussians of margins, as a fraction of the cap: a tenth shows no more."""
 CANDIDATES = 32  # at first, for each Gaussian that may stay: most lie within another frame
 SIZE = 0.7  # standard deviation of a Gaussian, and its minimum distance from the frame, in steps
 OPACITY = 0.9
@@ -46,14 +45,14 @@ camera beside that one, it would hide everything."""
 
 
 def has_margins(settings: TrainSettings, views: Sequence[View]) -> bool:
-    """Whether the model of a run gets margins: with few photographs that show all there is.
+    """Whether the model of a run on these views gets margins.
 
     Not where the number of Gaussians stays, of 3DGS as published, of a run that continues one, or
     of objects cut out.
     """
     cut_out = any(view.empty is not None or view.opacity is not None for view in views)
     grows = settings.traits.number_grows and not settings.as_3dgs and settings.start is None
-    return grows and not cut_out and len(views) <= MAX_PHOTOGRAPHS
+    return grows and not cut_out
 
 
 def with_room(settings: TrainSettings) -> TrainSettings:
@@ -74,7 +73,7 @@ def with_margins(
     They are at most ``SHARE`` of the ``cap``, or of the model without one; with one the faintest
     Gaussians make room if they have to.
     """
-    limit = SHARE * (len(model) if cap is None else cap)
+    limit = max(1.0, SHARE * (len(model) if cap is None else cap))
     side, step = _resolution(views, limit)
     renderer = ModelRenderer(model, frame, device)
     small = [_reduced(view, side) for view in views]

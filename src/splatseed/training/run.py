@@ -163,7 +163,7 @@ class TrainingRun:
         return result
 
     def _model(self) -> Gaussians:
-        """Return the Gaussians in the scene's frame; with margins, if photographs are few."""
+        """Return the Gaussians in the scene's frame; with margins."""
         model = self.frame.gaussians_to_world(gaussians_of(self.state.params))
         views, cap = self._train_views, self.settings.cap
         if not has_margins(self.settings, views):
