@@ -25,7 +25,7 @@ BUDGET = 6000
 def few(room):
     """Six photographs, which is quicker, seeded as more would be."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(few_photographs, "MAX_PHOTOGRAPHS", 5)
+        patch.setattr(few_photographs, "MAX_WITH_POINTS", 5)
         yield room.replace(images=room.images[:6])
 
 

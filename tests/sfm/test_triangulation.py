@@ -14,6 +14,7 @@ from splatseed.errors import MissingDependencyError
 from splatseed.methods import source_code
 from splatseed.pointcloud import PointCloud
 from splatseed.projection import project
+from splatseed.seeding import few_photographs
 from splatseed.seeding.photo_methods import read_views
 from splatseed.sfm import triangulation
 from splatseed.sfm._kernels import match_along_lines
@@ -93,6 +94,7 @@ def test_auto_adds_them_where_there_are_no_points(bare, points, monkeypatch):
     def fail(*_):
         raise MissingDependencyError("pycolmap", found="none", fix="Get it")
 
+    monkeypatch.setattr(few_photographs, "MAX_PHOTOGRAPHS", 12)  # so that 16 are many
     clouds, notes = [], {}
     for made in (lambda *_: points, fail):
         monkeypatch.setattr(triangulation, "triangulate", made)

@@ -396,16 +396,25 @@ def _source_rows(scene: Scene) -> list[tuple[str, str]]:
         ("cameras", ", ".join(cameras) or "none"),
         ("images", images if scene.images else "none"),
     ]
-    if _has_pixel_seeds(scene):
-        few = "method auto gives every second pixel a seed; docs/few_photographs.md"
-        rows.append(("few photographs", few))
+    few = _has_pixel_seeds(scene)
+    if few is not False:
+        seeds = "method auto gives every second pixel a seed; docs/few_photographs.md"
+        rows.append(("few photographs", seeds if few else f"unless they are close, {seeds}"))
     return rows
 
 
-def _has_pixel_seeds(scene: Scene) -> bool:
-    """Whether method auto takes the training photographs for few."""
-    train, _ = scene.split(scene.default_test_every)
-    return scene.has_photographs and Auto().fills_pixels(scene, len(train))
+def _has_pixel_seeds(scene: Scene) -> bool | None:
+    """Whether method auto takes the training photographs for few; None if it depends on seeds."""
+    if not scene.has_photographs:
+        return False
+    from splatseed.seeding.few_photographs import MAX_PHOTOGRAPHS
+
+    cameras = [image.camera for image in scene.split(scene.default_test_every)[0]]
+    if not 2 <= len(cameras) <= MAX_PHOTOGRAPHS:
+        return False
+    points = scene.points.originals
+    few = Auto().fills_pixels(scene, cameras, points.xyz[points.finite])
+    return few or (False if len(points) or Auto().uses_maps(scene) else None)
 
 
 def _depth_map_rows(

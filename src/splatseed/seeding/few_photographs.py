@@ -8,12 +8,14 @@ Promise: the same photographs give the same bytes, whatever the number of thread
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float32, Float64
 from scipy.ndimage import uniform_filter
 
+from splatseed.camera import Camera
 from splatseed.depth.stereo.coarse import downsampled
 from splatseed.depth.stereo.semiglobal import semiglobal_depths
 from splatseed.methods import source_code
@@ -21,12 +23,17 @@ from splatseed.photos.view import View
 from splatseed.photos.visibility import points_in_image
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress
+from splatseed.sampling import evenly_spaced
 from splatseed.seeding.cover import MAX_CONFIDENCE
 
-MAX_PHOTOGRAPHS = 12
-"""Maximum number of photographs that count as few."""
+MAX_PHOTOGRAPHS, MAX_WITH_POINTS = 32, 12
+"""Maximum number of photographs that count as few, and where the scene comes with points."""
+MIN_ANGLE = 2.0
+"""Minimum angle between neighbouring photographs, in degrees (``angle_between``). With photographs
+closer together, as of a video, depth between others' seeds is better guessed from these."""
 SIDE = 512
 """Longer side of the photographs that are matched, about, in pixels."""
+MAX_POINTS, MIN_SHARED = 4_000, 20  # points of which angles are taken, in all and of two views
 SPACING = 2  # pixels of these photographs between seeds
 SAME_DEPTH = 0.02  # relative difference of depth at which views agree
 SEEN_PAST = 0.05  # a seed that much nearer than what a view sees is in front of it
@@ -48,6 +55,41 @@ def pixel_seeds(
     views = [downsampled(view, SIDE) for view in views]
     depths = semiglobal_depths(views, xyz, progress)
     return PointCloud.concatenate(*(_seeds_of(i, views, depths) for i in range(len(views))))
+
+
+def are_few(
+    cameras: Sequence[Camera], xyz: Float64[np.ndarray, "M 3"], *, has_points: bool
+) -> bool:
+    """Whether photographs are so few, and so far apart, that each pixel needs a depth.
+
+    ``xyz`` are the scene's points, if it has any, and seeds; without any of these it is False.
+    """
+    limit = MAX_WITH_POINTS if has_points else MAX_PHOTOGRAPHS
+    few = len(xyz) > 0 and 2 <= len(cameras) <= limit
+    return few and angle_between(cameras, xyz) >= MIN_ANGLE
+
+
+def angle_between(cameras: Sequence[Camera], xyz: Float64[np.ndarray, "M 3"]) -> float:
+    """Return the angle at which two or more neighbouring cameras see points, in degrees.
+
+    It is the median over the cameras of the second smallest angle to another camera, which is the
+    median over the points in both frames; 180 where next to no points are.
+    """
+    xyz = xyz[evenly_spaced(len(xyz), MAX_POINTS)]
+    seen = np.zeros((len(cameras), len(xyz)), bool)
+    rays = np.empty((len(cameras), len(xyz), 3))
+    for i, camera in enumerate(cameras):
+        seen[i, points_in_image(camera, xyz)[0]] = True
+        rays[i] = xyz - camera.center
+    rays /= np.maximum(np.linalg.norm(rays, axis=2, keepdims=True), np.finfo(float).tiny)
+    angles = np.full((len(cameras), len(cameras)), 180.0)
+    for i, j in itertools.combinations(range(len(cameras)), 2):
+        both = seen[i] & seen[j]
+        if both.sum() >= MIN_SHARED:
+            cosine = np.median((rays[i, both] * rays[j, both]).sum(axis=1))
+            angles[i, j] = angles[j, i] = np.degrees(np.arccos(min(cosine, 1.0)))
+    second = np.sort(angles, axis=1)[:, min(2, len(cameras) - 1) - 1]
+    return float(np.median(second))
 
 
 def _seeds_of(

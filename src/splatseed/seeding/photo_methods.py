@@ -14,7 +14,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
+from jaxtyping import Float32
 
+from splatseed.camera import Camera
 from splatseed.depth.stereo.maps import MAX_GRID, MIN_POINTS, StereoSettings
 from splatseed.depthmap import MIN_CONFIDENCE, in_scene_units
 from splatseed.errors import (
@@ -127,18 +129,23 @@ class Stereo(PhotographMethod):
             found = _confirmed_share(scene, stereo, time.perf_counter() - start)
             for finding in (*found, *findings, *mismatch):
                 note(finding)
-            triangulated = self.triangulate(scene, views, timed, note)
+            known = PointCloud.concatenate(scene.points.originals, seeds)
+            cameras = [view.camera for view in views]
+            few = self.fills_pixels(scene, cameras, known.xyz[known.finite])
+            triangulated = PointCloud.empty()
+            if not few:
+                triangulated = self.triangulate(scene, views, timed, note)
             if len(triangulated):  # known from here on, like a scene's points
                 scene = scene.replace(points=triangulated.with_source(ORIGINAL), tracks=None)
-            points = self.fill(scene, seeds, stereo, rng, timed, note)
+            points = self.fill(scene, seeds, stereo, rng, timed, note, few=few)
         if on_stereo is not None:
             on_stereo(stereo)
-        if budget is None or not self.dense or self.fills_pixels(scene, len(views)):
+        if budget is None or not self.dense or few:
             return PointCloud.concatenate(triangulated, points)
         first = Comparison(images, stereo, self.max_size, self.spacing, times.seconds())
 
         def refill(denser: PointCloud) -> PointCloud:
-            return self.fill(scene, denser, stereo, rng, progress, silent_note)
+            return self.fill(scene, denser, stereo, rng, progress, silent_note, few=False)
 
         counted_in = scene
         if region is not None and len(triangulated):  # which are dropped outside of it
@@ -173,11 +180,15 @@ class Stereo(PhotographMethod):
         rng: np.random.Generator,
         progress: Progress,
         note: Note,
+        *,
+        few: bool,
     ) -> PointCloud:
         """Add seeds where stereo found none; this method adds none."""
         return seeds
 
-    def fills_pixels(self, scene: Scene, num_views: int) -> bool:
+    def fills_pixels(
+        self, scene: Scene, cameras: Sequence[Camera], xyz: Float32[np.ndarray, "M 3"]
+    ) -> bool:
         """Whether ``fill`` makes seeds as dense as the pixels; this method does not."""
         return False
 
@@ -235,35 +246,42 @@ class Auto(Stereo):
         rng: np.random.Generator,
         progress: Progress,
         note: Note,
+        *,
+        few: bool,
     ) -> PointCloud:
         """Add a seed in each cell that stereo leaves empty, at a measured depth if there is one."""
         known = PointCloud.concatenate(scene.points.originals, seeds)
-        if len(known) and self.fills_pixels(scene, len(stereo.views)):
+        if few:
             from splatseed.seeding.few_photographs import pixel_seeds
 
             num = len(stereo.views)
             text = f"Few photographs ({num}): semi-global matching gives every second pixel a seed."
             note(Finding("few-photographs", text, "info"))
             return pixel_seeds(stereo.views, known.xyz.astype(np.float64), progress)
-        if self._has_measured(scene):
+        if self.uses_maps(scene):
             measured = self._from_maps(scene, stereo, known, progress, note)
             seeds = PointCloud.concatenate(seeds, measured)
             known = PointCloud.concatenate(known, measured)
         guessed = _cover(stereo.views, known, self.cell, rng, progress)
         return PointCloud.concatenate(seeds, guessed)
 
-    def fills_pixels(self, scene: Scene, num_views: int) -> bool:
+    def fills_pixels(
+        self, scene: Scene, cameras: Sequence[Camera], xyz: Float32[np.ndarray, "M 3"]
+    ) -> bool:
         """Whether photographs are so few that each pixel needs a depth; not if maps have it."""
-        from splatseed.seeding.few_photographs import MAX_PHOTOGRAPHS
+        from splatseed.seeding.few_photographs import are_few
 
-        return 2 <= num_views <= MAX_PHOTOGRAPHS and not self._has_measured(scene)
+        if self.uses_maps(scene):
+            return False
+        has_points = len(scene.points.originals) > 0
+        return are_few(cameras, xyz.astype(np.float64), has_points=has_points)
 
     def triangulate(
         self, scene: Scene, views: Sequence[View], progress: Progress, note: Note
     ) -> PointCloud:
         """Triangulate points of features, if there are neither points nor measured depths."""
-        known = len(scene.points.originals) or self._has_measured(scene)
-        if known or self.fills_pixels(scene, len(views)):
+        known = len(scene.points.originals) or self.uses_maps(scene)
+        if known:
             return PointCloud.empty()
         try:
             from splatseed.sfm.triangulation import triangulate
@@ -278,7 +296,7 @@ class Auto(Stereo):
         note(Finding("triangulated-points", text, "info"))
         return points.with_source(source_code("stereo"))
 
-    def _has_measured(self, scene: Scene) -> bool:
+    def uses_maps(self, scene: Scene) -> bool:
         """Whether the scene has measured depth maps that count."""
         return self.depth_maps and in_scene_units(scene.depths)
 

@@ -25,16 +25,17 @@ from splatseed.splat.rendering import ModelRenderer
 from splatseed.splat.training_frame import TrainingFrame
 from splatseed.training.settings import TrainSettings
 
-SIDE, MIN_SIDE = 512, 128
-"""Longer side, about, at which views are rendered, in pixels, and the shortest one."""
+SIDE, FULL_SIZE = 512, 24
+"""Longer side, about, at which views are rendered, in pixels, and the number of views from which on
+it shrinks."""
 WIDTH = 0.4
 """Width of the margin on each side, in longer sides of the frame."""
 STEP = 4
 """Minimum distance of Gaussians, in pixels of the rendered view."""
 SHARE = 0.025
 """Maximum number of Gaussians of margins, as a fraction of the cap: a tenth shows no more."""
-CANDIDATES = 32  # at first, for each Gaussian that may stay: most lie within another frame
-SIZE = 0.7  # standard deviation of a Gaussian, and its minimum distance from the frame, in steps
+SIZE = 0.7  # standard deviation of a Gaussian, in steps
+REACH = 2.5  # standard deviations at which a Gaussian ends: so far it stays away from each frame
 OPACITY = 0.9
 FAR = 0.1
 """Margins are at least as far as what this share of a view's pixels shows or lies beyond: nearer
@@ -74,8 +75,9 @@ def with_margins(
     Gaussians make room if they have to.
     """
     limit = max(1.0, SHARE * (len(model) if cap is None else cap))
-    side, step = _resolution(views, limit)
     renderer = ModelRenderer(model, frame, device)
+    # Many views are rendered smaller, so that all continuations fit into memory.
+    side, step = SIDE / max(1.0, math.sqrt(len(views) / FULL_SIZE)), STEP
     small = [_reduced(view, side) for view in views]
     depths = [renderer.depth(view) for view in small]
     values = [_continued(renderer.color(v), d) for v, d in zip(small, depths, strict=True)]
@@ -104,21 +106,7 @@ def with_margins(
     return Gaussians(**grown, antialiased=model.antialiased)
 
 
-def _resolution(views: Sequence[View], limit: float) -> tuple[int, int]:
-    """Return the side at which views are rendered, and the first distance of Gaussians.
-
-    Of many views with a low limit only a few Gaussians each remain, for which small ones do.
-    """
-    pixels = sum(
-        SIDE**2 * (r + 2 * WIDTH) * (1 + 2 * WIDTH)
-        for r in (min(v.width, v.height) / max(v.width, v.height) for v in views)
-    )
-    step = max(STEP, round(math.sqrt(pixels / (CANDIDATES * limit))))
-    factor = min(step // STEP, SIDE // MIN_SIDE)
-    return SIDE // factor, round(step / factor)
-
-
-def _reduced(view: View, side: int) -> View:
+def _reduced(view: View, side: float) -> View:
     factor = max(1, round(max(view.width, view.height) / side))
     width, height = view.width // factor, view.height // factor
     camera = Camera(scaled(view.K, 1 / factor), width, height, view.cam_from_world)
@@ -153,36 +141,44 @@ def _margin(
     values: Float64[np.ndarray, "h w 4"],
     step: int,
 ) -> tuple[Float64[np.ndarray, "M 3"], Float64[np.ndarray, "M 3"], Float64[np.ndarray, " M"]]:
-    """Return positions, colours and sizes of the Gaussians beyond the frame of view i."""
+    """Return positions, colours and sizes of the Gaussians beyond the frame of view i.
+
+    They lie in rings around it, each with twice the size and the distance of the one within.
+    """
     camera = views[i].camera
     around = _width((camera.height, camera.width))
-    row, column = np.mgrid[step // 2 : len(values) : step, step // 2 : values.shape[1] : step]
-    uv = np.stack([column.ravel(), row.ravel()], axis=1) + 0.5 - around
-    continuation = values[row.ravel(), column.ravel()]
+    places, steps = [], []
+    while (gap := REACH * SIZE * step) < around:
+        row, column = np.mgrid[step // 2 : len(values) : step, step // 2 : values.shape[1] : step]
+        pixels = np.stack([column.ravel(), row.ravel()], axis=1)
+        beyond = _beyond(pixels + 0.5 - around, camera)
+        places.append(pixels[(beyond > gap) & (beyond <= 2 * gap)])
+        steps.append(np.full(len(places[-1]), step))
+        step *= 2
+    pixels = np.concatenate(places)
+    continuation = values[pixels[:, 1], pixels[:, 0]]
     colors, inverse = continuation[:, :3], continuation[:, 3]
-    beyond = _beyond(uv, camera)
-    used = (beyond > SIZE * step) & (inverse > 0)
-    uv, z, beyond = uv[used], 1.0 / inverse[used], beyond[used]
-    xyz = camera.unproject(uv, z)
-    kept = _unseen(xyz, i, views, beyond)
+    used = inverse > 0
+    uv, z = pixels[used] + 0.5 - around, 1.0 / inverse[used]
+    xyz, sizes = camera.unproject(uv, z), SIZE * np.concatenate(steps)[used] * z / camera.K[0, 0]
+    kept = _unseen(xyz, sizes, i, views)
     for view, clearance in zip(views, near, strict=True):
         kept &= np.linalg.norm(xyz - view.camera.center, axis=1) >= clearance
-    return xyz[kept], colors[used][kept], SIZE * step * z[kept] / camera.K[0, 0]
+    return xyz[kept], colors[used][kept], sizes[kept]
 
 
 def _unseen(
-    xyz: Float64[np.ndarray, "M 3"],
-    i: int,
-    views: Sequence[View],
-    beyond: Float64[np.ndarray, " M"],
+    xyz: Float64[np.ndarray, "M 3"], sizes: Float64[np.ndarray, " M"], i: int, views: Sequence[View]
 ) -> Bool[np.ndarray, " M"]:
-    """Select points that are in no other frame, and nearest to that of view i."""
+    """Select Gaussians that reach into no other frame, and are nearest to that of view i."""
     kept = np.ones(len(xyz), bool)
+    own = _beyond(views[i].camera.project(xyz)[0], views[i].camera)
     for j, other in enumerate(views):
         if j != i:
             uv, z = other.camera.project(xyz)
+            reach = REACH * sizes * other.camera.K[0, 0]  # in pixels, times z
             distance = _beyond(uv, other.camera)
-            kept &= (z <= 0) | ((distance > 0) & (distance >= beyond))
+            kept &= (z <= 0) | ((distance * z > reach) & (distance >= own))
     return kept
 
 
