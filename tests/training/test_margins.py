@@ -69,6 +69,15 @@ def test_no_margin_hides_what_another_camera_shows(room):
         assert distance.min() > 0.99 * np.quantile(depth[depth > 0], NEAR)
 
 
+def test_a_small_cap_leaves_room_for_none(room):
+    views = load_views(room, room.images)[:3]
+    model = initial_gaussians(room.points, opacity=0.9)
+    frame = training_frame(views, room.points.xyz)
+    assert len(with_margins(model, frame, views, len(model))) <= len(model)
+    few = model.select(np.arange(20))
+    assert len(with_margins(few, frame, views, 20)) <= 20
+
+
 def _wider(view):
     """The view with a frame that is wider by a fifth on each side."""
     K = view.K.copy()

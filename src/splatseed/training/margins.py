@@ -115,19 +115,19 @@ def _reduced(view: View, side: float) -> View:
 
 def _continued(
     color: Float32[np.ndarray, "H W 3"], depth: Float32[np.ndarray, "H W"]
-) -> Float64[np.ndarray, "h w 4"]:
+) -> Float32[np.ndarray, "h w 4"]:
     """Return colours and inverse depths of a view and of a margin around it."""
     around = _width(depth.shape)
     known = np.pad(depth > 0, around)
     inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0)
     values = np.concatenate([color, inverse[..., None]], axis=2)
-    values = np.pad(values, ((around, around), (around, around), (0, 0)))
+    values = np.pad(values.astype(np.float32), ((around, around), (around, around), (0, 0)))
     if not known.any():
         return values
     far = np.quantile(values[known, 3], FAR)
     filled = continued(values, known)
     filled[..., 3] = np.where(known, filled[..., 3], np.minimum(filled[..., 3], far))
-    return filled
+    return np.asarray(filled, np.float32)
 
 
 def _width(shape: tuple[int, ...]) -> int:
@@ -138,7 +138,7 @@ def _margin(
     i: int,
     views: Sequence[View],
     near: Sequence[float],
-    values: Float64[np.ndarray, "h w 4"],
+    values: Float32[np.ndarray, "h w 4"],
     step: int,
 ) -> tuple[Float64[np.ndarray, "M 3"], Float64[np.ndarray, "M 3"], Float64[np.ndarray, " M"]]:
     """Return positions, colours and sizes of the Gaussians beyond the frame of view i.
@@ -147,7 +147,7 @@ def _margin(
     """
     camera = views[i].camera
     around = _width((camera.height, camera.width))
-    places, steps = [], []
+    places, steps = [np.empty((0, 2), np.int64)], [np.empty(0, np.int64)]
     while (gap := REACH * SIZE * step) < around:
         row, column = np.mgrid[step // 2 : len(values) : step, step // 2 : values.shape[1] : step]
         pixels = np.stack([column.ravel(), row.ravel()], axis=1)
