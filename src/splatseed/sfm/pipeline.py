@@ -438,8 +438,8 @@ def refined(
             scene, found.poses, unfit_points, progress, test_every=test_every, color=color
         )
         how = (
-            f"{_what_stays(own, len(kept))}{count} triangulated at refined poses, which lower the "
-            f"mean reprojection error from {change.error_before:.2f} to {change.error_after:.2f} "
+            f"{_what_stays(own, len(kept), count)} at refined poses, which lower the mean "
+            f"reprojection error from {change.error_before:.2f} to {change.error_after:.2f} "
             f"px: cameras turned by {change.median_turn:.2f} degrees and moved by "
             f"{change.median_shift:.3g} units, both the median."
         )
@@ -452,12 +452,14 @@ def refined(
     return RefinedScene(scene, len(kept), (Finding("refined-poses", how, "info"), *fits))
 
 
-def _what_stays(own: int, kept: int) -> str:
-    """Begin a sentence that goes on with a number of triangulated points."""
+def _what_stays(own: int, kept: int, triangulated: str) -> str:
+    """Begin a sentence about the scene's points and those triangulated."""
+    if not own:
+        return f"{triangulated} points are triangulated"
     if kept == own:
-        return f"The scene's {own:,} points stay, beside " if own else "There are "
+        return f"The scene's {own:,} points stay, beside {triangulated} triangulated"
     which = f"{own - kept:,} of the scene's {own:,}" if kept else f"The scene's {own:,}"
-    return f"{which} points are replaced by "
+    return f"{which} points are replaced by {triangulated} triangulated"
 
 
 _LARGE = 1600  # px; longer sides of photographs whose features suffice without doubling
