@@ -21,6 +21,7 @@ from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.similarity import Similarity
 from splatseed.training.folder import model_file
+from splatseed.training.request import ExcludeChoice
 from splatseed.training.settings import Backend
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
@@ -59,6 +60,9 @@ class Options:
     of a scene (a COLMAP model, a transforms.json, ...), in the world of the model's scene;
     graphdeco's cameras.json or a camera path, in the world of the model's file. A folder as output
     gets a PNG of each camera's name."""
+    exclude: ExcludeChoice = ()
+    """Photographs whose cameras are left out, of --cameras or else of the model's scene: a name, a
+    pattern such as 'IMG_00*', or a .txt file of these."""
     transform: Annotated[str | None, tyro.conf.arg(metavar="FILE|gsplat|flipped|none")] = None
     """Transform from the scene's world to the path's or the cameras', if that is not the model's:
     the dataparser_transforms.json of nerfstudio's run, or other values of evaluate --transform;
@@ -203,8 +207,13 @@ def _open_models(options: Options) -> list[ViewerItem]:
     scene = options.scene
     if scene is None and options.cameras and is_scene(options.cameras):
         scene = None if options.model.is_dir() else options.cameras  # a run has its own
+    refuse(
+        (options.exclude and options.file and not is_scene(options.file),
+         "--exclude with cameras of a scene", options.file, "Leave one of them out."),
+    )  # fmt: skip
+    excluded = () if options.cameras else options.exclude
     named = zip(unique_names(paths), paths, strict=True)
-    items = [replace(open_item(path, scene), name=name) for name, path in named]
+    items = [replace(open_item(path, scene, excluded), name=name) for name, path in named]
     fix = "Train it first (splatseed train), or view it with splatseed view."
     for path, item in zip(paths, items, strict=True):
         untrained = item.gaussians is None
@@ -241,7 +250,7 @@ def _flight(options: Options, item: ViewerItem) -> _Flight:
     chosen, cameras = _chosen_size(options), item.central_views
     size = next((even_size(v.width, v.height, DEFAULT_SIDE) for v in cameras), WITHOUT_CAMERAS)
     if options.cameras is not None:
-        given = read_cameras(options.cameras, item.scene)
+        given = read_cameras(options.cameras, item.scene, options.exclude)
         sizes = {(view.width, view.height) for view in given.views}
         refuse(
             (options.is_video and chosen is None and len(sizes) > 1,

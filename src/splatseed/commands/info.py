@@ -18,7 +18,7 @@ import tyro
 from splatseed.camera import Intrinsics
 from splatseed.commands import next_steps
 from splatseed.commands.capture_check import CaptureCheck, PoseCheck, check_capture
-from splatseed.commands.next_steps import Commands, Planned, TrainerName
+from splatseed.commands.next_steps import Commands, Planned, TrainerName, excluding
 from splatseed.commands.options import check_free, parse_options, refuse
 from splatseed.console import (
     OUT,
@@ -196,16 +196,7 @@ def _show(options: Options, scene: Scene, facts: _Facts) -> None:
         commands = _next(options, usable, advice, planned, facts.known, check.poses)
         if check.first and len(scene.points):
             commands = [("once that is mended", f"splatseed info {quoted(options.scene)}")]
-        print_next(_excluding(commands, options.exclude))
-
-
-def _excluding(commands: Commands, patterns: Sequence[str]) -> Commands:
-    """Add ``--exclude`` to the commands that read the scene's photographs."""
-    words = "".join(f" --exclude {quoted(pattern)}" for pattern in patterns)
-    verbs = tuple(
-        f"splatseed {verb} " for verb in ("info", "upsample", "train", "sfm", "undistort")
-    )
-    return [(label, f"{line}{words * line.startswith(verbs)}") for label, line in commands]
+        print_next(excluding(commands, options.scene, options.exclude))
 
 
 def _shows_model(options: Options) -> bool:
