@@ -164,16 +164,13 @@ def run(arguments: list[str]) -> None:
             videos.write_video(options.output, pictures(), size, flight.fps)
         else:
             videos.write_pictures(options.output, pictures(), names, overwrite=options.overwrite)
+        guessed = videos.guessed_findings(renderers[0], views, items[0].train_views, clock)
     _summarise(options, flight, clock.seconds().get("render", 0.0))
-    print_note(*(finding for item in items for finding in item.findings))
-    print_note(*flight.findings)
+    print_note(*(finding for item in items for finding in item.findings), *flight.findings)
     if path is not None:
         size = views[0].width, views[0].height
         print_note(*path.findings(size, len(models[0]), len(items[0].model)))
-    print_note(
-        *videos.unseen_findings(shown, names),
-        *videos.guessed_findings(renderers[0], views, items[0].train_views),
-    )
+    print_note(*videos.unseen_findings(shown, names), *guessed)
     if items[0].moved and flight.given and not flight.given.of_scene and options.transform is None:
         text = f"{options.file} is taken to be in the model's frame, too, and was transformed with "
         text += "it; for the scene's frame, pass --transform none."
