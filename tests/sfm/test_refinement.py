@@ -134,9 +134,15 @@ def test_a_scene_has_the_refined_poses_and_one_without_matches_its_own(room, tmp
     shutil.copytree(room.source.image_dir, photos)
     noise = np.random.default_rng(0).integers(0, 256, (192, 256, 3), np.uint8)
     PilImage.fromarray(noise).save(photos / "view_000.png")
-    given = room.replace(images=tuple(with_noise(room.images, 2.0, 3.0)))
+    noisy, own = tuple(with_noise(room.images, 2.0, 3.0)), room.points.select(slice(None))
+    given = room.replace(images=noisy, points=own, tracks=None)
     how = {"poses_from": given, "refine_poses": True, "test_names": {"view_003.png"}}
     report = reconstruct(photos, tmp_path / "out", **how)
+    scene = load_scene(report.path)
+    assert 0 < report.num_kept <= len(own) < report.num_points == len(scene.points)
+    there = np.isin(own.xyz[:, 0], scene.points.xyz[-report.num_kept :, 0])
+    assert there.sum() == report.num_kept
+    assert (scene.tracks.lengths > 0).sum() == report.num_points - report.num_kept
     shown = {image.name for image in load_scene(report.path).images}
     assert {image.name for image in report.poses} - shown == {"view_003.png"}
     found = sorted(report.poses, key=lambda image: image.name)

@@ -57,7 +57,7 @@ from splatseed.sfm.export import drop_repeats, export_scene
 from splatseed.sfm.gps import GpsFrame, GpsPosition, align_to_gps
 from splatseed.sfm.mapping import map_images
 from splatseed.sfm.matching import match_further, match_photographs
-from splatseed.sfm.own_points import points_kept, with_refined
+from splatseed.sfm.own_points import Color, add_own_points, points_kept, unchanged, with_refined
 from splatseed.sfm.panoramas import (
     PanoramaRig,
     PanoramasName,
@@ -95,6 +95,7 @@ class SfmReport:
     seconds: Mapping[str, float]  # wall time by stage, in order
     refinement: Refinement | None = None  # None without ``refine_poses``
     poses: tuple[Image, ...] = ()  # the known poses, refined with ``refine_poses``
+    num_kept: int = 0  # points of the given scene that stay, which have no track
     num_pairs: int = 0  # matched pairs of photographs
     gps: GpsFrame | None = None  # the frame, if it is that of GPS positions
     findings: tuple[Finding, ...] = ()  # a lens held, poses that may be wrong or were not refined
@@ -125,6 +126,7 @@ def reconstruct(
     on_progress: Progress = silent,
     on_photos: OnPhotos | None = None,
     note: Note = silent_note,
+    color: Color = unchanged,
 ) -> SfmReport:
     """Reconstruct a scene: features, matching, mapping or triangulation, undistortion.
 
@@ -149,10 +151,11 @@ def reconstruct(
         panoramas: Which photographs are equirectangular panoramas, if poses are not known: those
             recognised, ``all`` or ``none``. Each is cut into six photographs, which get one pose.
         mask_below: Angle of straight down, in degrees, within which panoramas are masked.
-        poses_from: A scene with poses and intrinsics; its points are ignored.
+        poses_from: A scene with poses and intrinsics; its points are ignored, or those with tracks.
         refine_poses: Refine poses that are off by a few degrees or per cent of the cameras' extent
             (phones, SLAM). They are unchanged if refinement would lower the mean reprojection
-            error by less than 0.1 px.
+            error by less than 0.1 px. The points of ``poses_from`` without tracks (LiDAR, a mesh)
+            stay beside the triangulated ones, as by ``refined``.
         test_names: Posed photographs, by name, whose poses are refined with the others but which
             neither contribute points nor appear in the scene, such as test views.
         exclude: Photographs to leave out: names or patterns, as for ``io.exclusion.exclude``.
@@ -166,6 +169,7 @@ def reconstruct(
         on_photos: Called before work starts with the photographs' names, the names of skipped
             images by reason, and a description of the cameras (empty if poses are known).
         note: Called with findings on resumed work.
+        color: Gives colours to points that stay where they lack them.
 
     Raises:
         InputError: Photographs missing, unreadable or of another size than their known camera;
@@ -222,6 +226,10 @@ def reconstruct(
         with work if keep or resume else nullcontext() as kept:
             how = (images, staging, settings, on_progress, kept, _reconstruct)
             report: SfmReport = _call(*how, list(photos), cameras, rigs, *options)
+        if refine_poses and poses_from is not None and poses is not None:
+            source = replace(poses_from.source, image_dir=images)
+            given = poses_from.replace(images=poses, source=source, masks=masks, depths=None)
+            report = _with_own_points(report, given, on_progress, color)
         posed = photos.keys() - {*report.unregistered}
         names = {name: faces.get(name, [name]) for name in (*others, *whole)}
         split = split_of_faces({n: [f for f in each if f in posed] for n, each in names.items()})
@@ -304,6 +312,16 @@ def _reconstruct(
     )
 
 
+def _with_own_points(
+    report: SfmReport, given: Scene, progress: Progress, color: Color
+) -> SfmReport:
+    """Add the points that stay of a given scene to the model that was written."""
+    model_dir = report.path / "sparse" / "0"
+    kept, fits = add_own_points(model_dir, given, report.poses, progress, color)
+    findings, number = (*report.findings, *fits), report.num_points + kept
+    return replace(report, num_points=number, num_kept=kept, findings=findings)
+
+
 def _export(
     run: ColmapRun, model_dir: Path, staging: Path, masks: Masks | None, *, distinct: bool = True
 ) -> None:
@@ -382,10 +400,6 @@ class RefinedScene(NamedTuple):
     findings: tuple[Finding, ...]
 
 
-def _unchanged(scene: Scene) -> Scene:
-    return scene
-
-
 def refined(
     scene: Scene,
     seed: int,
@@ -393,7 +407,7 @@ def refined(
     *,
     test_every: int = 0,
     unfit_points: UnfitPoints = "drop",
-    color: Callable[[Scene], Scene] = _unchanged,
+    color: Color = unchanged,
 ) -> RefinedScene:
     """Return the scene at refined poses, and what was done.
 
