@@ -23,7 +23,7 @@ from splatseed.seeding.clouds.point_colors import with_colors
 from splatseed.sfm import Settings, first_look, matching, reconstruct, with_refined
 from splatseed.sfm.colmap import ColmapRun, posed_model, require_pycolmap
 from splatseed.sfm.matching import match_photographs
-from splatseed.sfm.pipeline import _Refined, refined as refined_scene
+from splatseed.sfm.refined_scene import _Refined, refined as refined_scene
 from splatseed.sfm.refinement import (
     Poses,
     Refinement,
@@ -186,7 +186,7 @@ def test_poses_that_stay_among_refined_ones_are_named(room, tmp_path, monkeypatc
         change = Refinement(False, 9.0, 0.1, excluded=("view_000.png",))
         return _Refined(arguments[6], room.points, change)
 
-    monkeypatch.setattr("splatseed.sfm.pipeline._call", call)
+    monkeypatch.setattr("splatseed.sfm.refined_scene.call", call)
     note = refined_scene(scene, 0).findings[0]
     assert str(note).endswith(
         "The poses of 2 of 12 images stay as given: SfM does not read view_001.webp; fewer than 10 "
@@ -201,7 +201,7 @@ def refined_to(monkeypatch):
     def refine_to(scene, images, **options):
         made = PointCloud(np.arange(30.0).reshape(10, 3) / 1000, np.full((10, 3), 7, np.uint8))
         found = _Refined(tuple(images), made, Refinement(False, 9.0, 0.1))
-        monkeypatch.setattr("splatseed.sfm.pipeline._call", lambda *_: found)
+        monkeypatch.setattr("splatseed.sfm.refined_scene.call", lambda *_: found)
         result = refined_scene(scene, 0, **options)
         assert result.scene.images[2].translation is images[2].translation
         np.testing.assert_array_equal(result.scene.points.xyz[result.num_kept :], made.xyz)
