@@ -18,7 +18,7 @@ from splatseed.errors import ReconstructionError
 from splatseed.io import load_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import silent, silent_note
-from splatseed.scene import LeftOut, Tracks
+from splatseed.scene import LeftOut
 from splatseed.seeding.clouds.point_colors import with_colors
 from splatseed.sfm import Settings, first_look, matching, reconstruct, with_refined
 from splatseed.sfm.colmap import ColmapRun, posed_model, require_pycolmap
@@ -35,6 +35,7 @@ from splatseed.sfm.refinement import (
     turns,
     with_poses,
 )
+from splatseed.tracks import Tracks
 
 pycolmap = pytest.importorskip("pycolmap")
 
