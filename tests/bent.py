@@ -9,7 +9,7 @@ from scipy.ndimage import map_coordinates
 
 from splatseed.camera import Intrinsics
 from splatseed.lens import project_rays, unproject_pixels
-from splatseed.scene import Observations
+from splatseed.tracks import Observations
 
 COEFFICIENTS = (-0.12, 0.02, 0.002, -0.003)
 """Of OPENCV: straight lines at the photographs' edges are bent by some pixels."""

@@ -288,7 +288,7 @@ class CalledHere:
 @pytest.fixture
 def pycolmap_here(monkeypatch):
     """Reconstructs in this process, where its child is not the subject: it takes two seconds."""
-    monkeypatch.setattr("splatseed.sfm.pipeline.Child", CalledHere)
+    monkeypatch.setattr("splatseed.sfm.child.Child", CalledHere)
 
 
 @pytest.fixture

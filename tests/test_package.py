@@ -27,8 +27,8 @@ SOURCE = Path(splatseed.__file__).parent
 
 ORDER = (
     "errors", "text", "settings", "requirements", "findings", "progress", "frozen", "sampling",
-    "projection", "runtime", "camera", "similarity", "lens", "pointcloud", "depthmap", "scene",
-    "scores", "io", "photos", "depth", "methods", "checkup", "sfm", "seeding", "synthetic",
+    "projection", "runtime", "camera", "similarity", "lens", "pointcloud", "depthmap", "tracks",
+    "scene", "scores", "io", "photos", "depth", "methods", "checkup", "sfm", "seeding", "synthetic",
     "rendering", "splat", "training", "integrations", "viewer", "bench", "console", "commands",
     "cli",
 )  # fmt: skip

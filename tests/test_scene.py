@@ -13,8 +13,9 @@ from splatseed.depth.stereo import StereoMap
 from splatseed.depthmap import DepthMap
 from splatseed.errors import ParameterError, SceneNotFoundError, UnknownNameError
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import NO_POINT, Image, Masks, Observations, Scene, SceneSource, Tracks
+from splatseed.scene import Image, Masks, Scene, SceneSource
 from splatseed.similarity import Similarity
+from splatseed.tracks import NO_POINT, Observations, Tracks
 
 INTRINSICS = Intrinsics(1, "PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0))
 

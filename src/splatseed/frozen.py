@@ -22,6 +22,12 @@ def read_only(values: Any, dtype: Any = None) -> np.ndarray:
     return array
 
 
+def freeze(record: object, *names: str) -> None:
+    """Replace arrays of a frozen record by read-only ones."""
+    for name in names:
+        object.__setattr__(record, name, read_only(getattr(record, name)))
+
+
 def read_only_view(array: np.ndarray) -> np.ndarray:
     """Return a read-only view of an array that may be writable.
 

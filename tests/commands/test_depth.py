@@ -101,6 +101,12 @@ def test_a_plain_folder(room, tmp_path, splatseed, stereo):
     assert json.loads((out / "splatseed.json").read_text())["options"]["colmap"] is False
     assert splatseed(*words, "--overwrite", "--max-size", 500).code == 0
     assert stereo.calls == [(12, 800), (12, 500)]
+    run = splatseed(*words, "--overwrite", "--exclude", known.name)
+    assert f"left out: {known.name}" in run.err
+    assert known.name not in {*find_depths(load_scene(room), out)}
+    lines = [line for line in run.out.splitlines() if f"splatseed upsample {room}" in line]
+    assert lines
+    assert all(line.endswith(f"--exclude {known.name}") for line in lines)
 
 
 @pytest.fixture(scope="module")
@@ -118,6 +124,9 @@ def test_a_distorted_capture_becomes_a_cloud_on_its_surfaces(bent, capture, tmp_
     assert (run.code, run.unexpected) == (0, "")
     assert f"splatseed info {out} --depth {out}" in run.out
     assert splatseed("info", out, "--depth", out).code == 0
+    name = load_scene(bent).images[0].name
+    splatseed("depth", bent, "--colmap", "-o", out, "--overwrite", "--exclude", name)
+    assert load_scene(out).absent == (name,)  # it counts for the split into training and test views
     if shutil.which("colmap") is None:
         pytest.skip("colmap is not installed: the command that was printed is not run")
     line = next(line for line in run.out.splitlines() if "stereo_fusion" in line)

@@ -94,6 +94,12 @@ def test_what_a_format_costs_is_told(of_room, room, splatseed, tmp_path, rng):
     assert before > 12
     assert abs(before - after) < 0.1
     assert "2 test views" in faithful.out
+    fewer = splatseed(*words, "--scene", room, "--exclude", "view_000*")
+    assert "1 test view" in fewer.out
+    assert "1 photograph is left out: view_000.png" in fewer.err
+    assert "--exclude 'view_000*'" in fewer.out
+    assert numbers(fewer.out, "score") != numbers(faithful.out, "score")
+    assert splatseed(*words, "--exclude", "view_000*").code == 2  # no scene
     assert numbers(splatseed(*words).out, "likeness")[0] > 40
     assert "costs the model" not in faithful.out + faithful.err
     model = read_gaussians(of_room)  # beyond what an .spz holds

@@ -18,7 +18,7 @@ from splatseed.console import LiteralConsole
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene, write_scene
 from splatseed.pointcloud import PointCloud
-from splatseed.sfm import Refinement, pipeline
+from splatseed.sfm import Refinement, refined_scene
 
 pytest.importorskip("torch", reason="training needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
@@ -83,14 +83,14 @@ def refining(room, monkeypatch):
     truth, calls = load_scene(room), []
 
     def call(folder, staging, settings, progress, kept, job, poses, test_names, masks, has_points):
-        assert job is pipeline._refine
+        assert job is refined_scene._refine
         assert not has_points
         assert test_names == {image.name for image in truth.split(8)[1]}
         calls.append(folder)
         change = Refinement(False, 9.0, 0.5, 0.1, 0.2, 0.1, 0.2)
-        return pipeline._Refined(truth.images, truth.points, change)
+        return refined_scene._Refined(truth.images, truth.points, change)
 
-    monkeypatch.setattr(pipeline, "_call", call)
+    monkeypatch.setattr(refined_scene, "call", call)
     return calls
 
 
@@ -190,9 +190,9 @@ def refinement_of_room(room, monkeypatch):
             images = truth.images
             if not kept:
                 images = [replace(i, translation=i.translation + 0.01) for i in images]
-            return pipeline._Refined(tuple(images), points, change)
+            return refined_scene._Refined(tuple(images), points, change)
 
-        monkeypatch.setattr(pipeline, "_call", call)
+        monkeypatch.setattr(refined_scene, "call", call)
 
     return stand_in
 
@@ -200,7 +200,7 @@ def refinement_of_room(room, monkeypatch):
 def test_points_stay_where_refinement_gains_nothing(room, refinement_of_room, splatseed, tmp_path):
     refinement_of_room(kept=True)
     own, scene = load_scene(room), load_scene(room)
-    same, number, (finding,) = pipeline.refined(own, 0)
+    same, number, (finding,) = refined_scene.refined(own, 0)
     note = str(finding)
     assert (same, number) == (own, len(own.points))
     words = ("--method", "linear", "--ratio", "2", "-o")
@@ -238,8 +238,8 @@ def test_points_of_a_scan_stay_in_a_resumed_run_too(
 ):
     truth, run = load_scene(room), tmp_path / "run"
     near = PointCloud(truth.points.xyz[:100] + 0.001, truth.points.rgb[:100])
-    found = pipeline._Refined(truth.images, near, Refinement(False, 9.0, 0.5))
-    monkeypatch.setattr(pipeline, "_call", lambda *_: found)
+    found = refined_scene._Refined(truth.images, near, Refinement(False, 9.0, 0.5))
+    monkeypatch.setattr(refined_scene, "call", lambda *_: found)
     scanned = as_by_a_device(truth)
     images = tuple(replace(image, observations=None) for image in scanned.images)
     write_scene(scanned.replace(images=images, points=truth.points), tmp_path / "scanned")

@@ -23,7 +23,7 @@ from splatseed.camera import rotation_from_quat
 from splatseed.commands.upsample.command import LoadedCloud
 from splatseed.findings import Finding
 from splatseed.io import load_scene, write_scene
-from splatseed.io.nerfstudio import read_cloud_transform
+from splatseed.io.matrices import read_cloud_transform
 from splatseed.io.origin import translated
 from splatseed.io.ply import read_ply, write_ply
 from splatseed.io.seeds import method_of_points

@@ -14,7 +14,8 @@ from splatseed.camera import Intrinsics
 from splatseed.io import colmap
 from splatseed.io.load import with_own_depths
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import Image, Observations, Scene, Tracks
+from splatseed.scene import Image, Scene
+from splatseed.tracks import Observations, Tracks
 
 
 class Model(NamedTuple):

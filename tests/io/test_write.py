@@ -16,7 +16,8 @@ from splatseed.errors import OutputError, PointCloudError
 from splatseed.io import colmap, load_scene, write_scene
 from splatseed.io.ply import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import Observations, Scene
+from splatseed.scene import Scene
+from splatseed.tracks import Observations
 
 from ..findings import texts
 

@@ -10,7 +10,7 @@ from splatseed import PointCloud, Scene
 from splatseed.methods import configure
 from splatseed.methods.neighbors import draw_bases, prepare, trusted_originals
 from splatseed.progress import silent
-from splatseed.scene import Tracks
+from splatseed.tracks import Tracks
 
 from . import references as slow
 

@@ -18,9 +18,9 @@ from splatseed.photos.loading import load_photograph, load_split, load_views
 from splatseed.photos.sizes import at_file_size
 from splatseed.photos.undistortion import undistort
 from splatseed.photos.view import camera_views
-from splatseed.scene import NO_POINT, Observations
 from splatseed.seeding.budget import points_within
 from splatseed.seeding.photo_methods import frames_of
+from splatseed.tracks import NO_POINT, Observations
 
 from ..findings import texts
 

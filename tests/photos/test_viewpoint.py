@@ -8,7 +8,8 @@ import pytest
 from splatseed.camera import Intrinsics
 from splatseed.photos.viewpoint import choose_camera, choose_image
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import Image, Observations, Scene
+from splatseed.scene import Image, Scene
+from splatseed.tracks import Observations
 
 LENS = Intrinsics(1, "PINHOLE", 160, 120, (150.0, 150.0, 80.0, 60.0))
 

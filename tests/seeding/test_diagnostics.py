@@ -11,8 +11,9 @@ from splatseed.camera import Intrinsics
 from splatseed.depthmap import DepthMap
 from splatseed.findings import Finding
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import Image, Masks, Scene, Tracks
+from splatseed.scene import Image, Masks, Scene
 from splatseed.seeding import diagnostics as module
+from splatseed.tracks import Tracks
 
 SHARES = [5, 25, 50, 75, 95]
 

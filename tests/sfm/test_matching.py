@@ -10,7 +10,7 @@ import pytest
 from PIL import Image as PilImage
 
 from splatseed.progress import silent
-from splatseed.sfm import Settings, pipeline
+from splatseed.sfm import Settings
 from splatseed.sfm.cameras import Photo, SharedCamera
 from splatseed.sfm.colmap import ColmapRun, guessed_model, posed_model, require_pycolmap
 from splatseed.sfm.database import run_database
@@ -113,8 +113,8 @@ def test_features_without_doubling_are_fewer_and_coarser(run):
 def test_poses_of_large_photographs_need_no_doubling():
     settings = Settings(seed=3)
     small, large = ({"a.jpg": Photo(size)} for size in ((1440, 1080), (1200, 1600)))
-    assert pipeline._for_poses(settings, small) == settings
+    assert settings.for_poses(small) == settings
     undoubled = replace(settings, max_image_size=2000, doubled=False)
-    assert pipeline._for_poses(settings, large) == undoubled
+    assert settings.for_poses(large) == undoubled
     chosen = replace(settings, max_image_size=1200)
-    assert pipeline._for_poses(chosen, large) == chosen
+    assert chosen.for_poses(large) == chosen

@@ -18,12 +18,12 @@ from splatseed.errors import ReconstructionError
 from splatseed.io import load_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import silent, silent_note
-from splatseed.scene import LeftOut, Tracks
+from splatseed.scene import LeftOut
 from splatseed.seeding.clouds.point_colors import with_colors
 from splatseed.sfm import Settings, first_look, matching, reconstruct, with_refined
 from splatseed.sfm.colmap import ColmapRun, posed_model, require_pycolmap
 from splatseed.sfm.matching import match_photographs
-from splatseed.sfm.pipeline import _Refined, refined as refined_scene
+from splatseed.sfm.refined_scene import _Refined, refined as refined_scene
 from splatseed.sfm.refinement import (
     Poses,
     Refinement,
@@ -35,6 +35,7 @@ from splatseed.sfm.refinement import (
     turns,
     with_poses,
 )
+from splatseed.tracks import Tracks
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -134,9 +135,15 @@ def test_a_scene_has_the_refined_poses_and_one_without_matches_its_own(room, tmp
     shutil.copytree(room.source.image_dir, photos)
     noise = np.random.default_rng(0).integers(0, 256, (192, 256, 3), np.uint8)
     PilImage.fromarray(noise).save(photos / "view_000.png")
-    given = room.replace(images=tuple(with_noise(room.images, 2.0, 3.0)))
+    noisy, own = tuple(with_noise(room.images, 2.0, 3.0)), room.points.select(slice(None))
+    given = room.replace(images=noisy, points=own, tracks=None)
     how = {"poses_from": given, "refine_poses": True, "test_names": {"view_003.png"}}
     report = reconstruct(photos, tmp_path / "out", **how)
+    scene = load_scene(report.path)
+    assert 0 < report.num_kept <= len(own) < report.num_points == len(scene.points)
+    there = np.isin(own.xyz[:, 0], scene.points.xyz[-report.num_kept :, 0])
+    assert there.sum() == report.num_kept
+    assert (scene.tracks.lengths > 0).sum() == report.num_points - report.num_kept
     shown = {image.name for image in load_scene(report.path).images}
     assert {image.name for image in report.poses} - shown == {"view_003.png"}
     found = sorted(report.poses, key=lambda image: image.name)
@@ -180,7 +187,7 @@ def test_poses_that_stay_among_refined_ones_are_named(room, tmp_path, monkeypatc
         change = Refinement(False, 9.0, 0.1, excluded=("view_000.png",))
         return _Refined(arguments[6], room.points, change)
 
-    monkeypatch.setattr("splatseed.sfm.pipeline._call", call)
+    monkeypatch.setattr("splatseed.sfm.refined_scene.call", call)
     note = refined_scene(scene, 0).findings[0]
     assert str(note).endswith(
         "The poses of 2 of 12 images stay as given: SfM does not read view_001.webp; fewer than 10 "
@@ -195,7 +202,7 @@ def refined_to(monkeypatch):
     def refine_to(scene, images, **options):
         made = PointCloud(np.arange(30.0).reshape(10, 3) / 1000, np.full((10, 3), 7, np.uint8))
         found = _Refined(tuple(images), made, Refinement(False, 9.0, 0.1))
-        monkeypatch.setattr("splatseed.sfm.pipeline._call", lambda *_: found)
+        monkeypatch.setattr("splatseed.sfm.refined_scene.call", lambda *_: found)
         result = refined_scene(scene, 0, **options)
         assert result.scene.images[2].translation is images[2].translation
         np.testing.assert_array_equal(result.scene.points.xyz[result.num_kept :], made.xyz)

@@ -1,8 +1,9 @@
-"""Training and scoring as users write them: through ``splatseed`` alone."""
+"""Training and scoring as users write them: through ``splatseed``."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import signal
 
@@ -11,6 +12,8 @@ import pytest
 
 import splatseed as ss
 from splatseed.errors import OutputError, ParameterError, SceneNotFoundError
+from splatseed.training.api import prepare_training
+from splatseed.training.request import TrainRequest
 
 SHORT = {"strategy": "none", "max_steps": 30, "data_factor": 2, "test_every": 3, "seeding": "scene"}
 
@@ -75,6 +78,9 @@ def test_wrong_arguments_are_named(trained, tmp_path):
         ({"long_side": 0}, "long_side"),
         ({"long_side": 48, "data_factor": 2}, "long_side"),
         ({"start": str(run.folder), "seeding": "auto"}, "start"),
+        ({"start": str(run.folder), "region": "0,0,0,1"}, "region"),
+        ({"seeding": "scene", "region": "0,0,0,1"}, "region"),
+        ({"region": "0,0,0,0"}, "region"),
     ):
         with pytest.raises(ParameterError, match=named):
             ss.train(scene, tmp_path / "run", **wrong)
@@ -114,3 +120,21 @@ def test_the_budget_limits_a_run(room_path, tmp_path):
     assert run.config["cap_max"] == 48 * 36 // 4
     assert run.metrics["num_gaussians"] <= 48 * 36 // 4
     assert "budget" in {each.kind for each in findings}
+
+
+def test_a_run_with_a_region_resumes_with_it(room_path, tmp_path):
+    scene = ss.load_scene(room_path)
+    text = ",".join(f"{value:.6g}" for value in [*np.median(scene.points.xyz, axis=0), 0.8])
+
+    def prepare(**options):
+        request = TrainRequest.of({**SHORT, "seeding": "auto", **options})
+        return prepare_training(scene, tmp_path / "run", request, note=findings.append)
+
+    findings = []
+    count = prepare(region=text).count()
+    (said,) = (each.text for each in findings if each.kind == "seeds-of-region")
+    assert "the others are left out" in said
+    assert count == prepare(resume=True).count()
+    assert json.loads((tmp_path / "run/config.json").read_text())["region"] == text
+    with pytest.raises(ParameterError, match="as when the run began"):
+        prepare(resume=True, region="0,0,0,9")

@@ -70,10 +70,18 @@ def test_no_margin_hides_what_another_camera_shows(room):
 
 
 def test_a_small_cap_leaves_room_for_none(room):
-    views = load_views(room, room.images)[:3]
+    views, stages = load_views(room, room.images)[:3], []
     model = initial_gaussians(room.points, opacity=0.9)
     frame = training_frame(views, room.points.xyz)
-    assert len(with_margins(model, frame, views, len(model))) <= len(model)
+    within = with_margins(
+        model, frame, views, len(model), progress=lambda *stage: stages.append(stage)
+    )
+    assert len(within) <= len(model)
+    assert {name for name, _ in stages} == {"margins"}
+    shares = [share for _, share in stages]
+    assert shares == sorted(shares)
+    assert shares.index(0.5) == 2  # of three views, before the first pass
+    assert shares[-1] == 1
     few = model.select(np.arange(20))
     assert len(with_margins(few, frame, views, 20)) <= 20
 

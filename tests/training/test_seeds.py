@@ -10,9 +10,10 @@ import pytest
 torch = pytest.importorskip("torch", reason="training needs PyTorch")
 
 from splatseed.io import load_scene, write_scene
+from splatseed.io.regions import parse_region
 from splatseed.io.staging import MANIFEST
 from splatseed.photos.loading import load_split
-from splatseed.pointcloud import PointCloud
+from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import silent
 from splatseed.splat.from_seeds import initial_gaussians
 from splatseed.training.initialization import MARGIN, min_view_depths
@@ -87,6 +88,23 @@ def test_a_plain_scene_is_seeded_on_request_and_the_user_told(room):
     empty = room.replace(points=room.points.select(slice(0)), tracks=None)
     assert len(seeded(empty, bounded, "cpu", findings.append, silent)[0].points) == 100
     assert not findings[-1].fix  # there are none to begin with
+
+
+def test_a_region_gets_new_points_also_where_none_are_advised(room):
+    scene = room.replace(points=_covering(room), tracks=None)
+    low, high = np.percentile(room.points.xyz, (20, 80), axis=0)
+    text = ",".join(f"{value:.6g}" for value in [*low, *high])
+    asked = TrainSettings(seeding="advised", strategy="grow", cap_max=20_000)
+    assert seeded(scene, asked, "cpu", print, silent)[0] is scene
+    everywhere = TrainSettings(seeding="auto", strategy="grow", cap_max=20_000)
+    clouds = [
+        seeded(scene, each, "cpu", print, silent)[0].points
+        for each in (dataclasses.replace(asked, region=text), everywhere)
+    ]
+    part, whole = (cloud.select(cloud.source != ORIGINAL) for cloud in clouds)
+    assert parse_region(text)(part.xyz).all()
+    assert 0 < len(part) < len(whole)
+    assert np.array_equal(clouds[0].originals.xyz, scene.points.xyz)
 
 
 def _covering(scene):

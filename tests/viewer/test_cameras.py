@@ -81,6 +81,10 @@ def test_flight_renders_given_cameras_by_name(room, run_folder, tmp_path, splats
     words = ("flight", run_folder, "--cameras", room, "-o", tmp_path / "renders")
     assert splatseed(*words).code == 2
     assert splatseed(*words, "--overwrite").code == 0
+    said = splatseed(*words, "--overwrite", "--exclude", "view_00*")
+    assert "10 photographs are left out: view_000.png" in said.err
+    fewer = [name for name in pictures if not name.startswith("view_00")]
+    assert sorted(path.name for path in (tmp_path / "renders").glob("*.png")) == fewer
 
 
 def test_a_path_shows_its_crop_box_before_its_background(room, run_folder, tmp_path, splatseed):

@@ -253,6 +253,16 @@ def test_a_flight_is_a_video_of_the_scene(run_folder, tmp_path, splatseed):
     assert np.abs(np.diff(frames.astype(int), axis=0)).mean() > 0.5  # it moves
 
 
+def test_photographs_that_are_left_out_have_no_camera(room, run_folder):
+    item, whole = open_item(run_folder, excluded=["view_001*", "view_003*"]), open_item(run_folder)
+    names = [view.name for view in whole.train_views]
+    kept = [name for name in names if name not in {"view_001.png", "view_003.png"}]
+    assert [view.name for view in item.train_views] == kept != names
+    assert [each.kind for each in item.findings] == ["excluded-photographs"]
+    with pytest.raises(ParameterError, match="whose scene is not known"):
+        open_item(run_folder / "point_cloud.ply", excluded=["view_001*"])
+
+
 def test_without_cameras_the_video_circles_with_a_note(run_folder, tmp_path, splatseed):
     ply = shutil.copy(run_folder / "point_cloud.ply", tmp_path / "model.ply")
     words = ("flight", ply, "--seconds", 0.05, "--size", "48x32", "-o")

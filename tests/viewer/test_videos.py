@@ -57,21 +57,37 @@ def test_frames_without_the_model_are_named():
     assert unseen_findings([0.4, 0.03], ["a", "b"]) == []
 
 
-def test_frames_that_leave_few_photographs_are_named():
+def _at(x, name):
+    pose = np.eye(4)
+    pose[0, 3] = -x
+    return replace(pinhole_view((200, 200), np.pi / 2, pose), name=name)
+
+
+def test_frames_that_leave_the_photographs_are_named():
     """Cameras of 90 degrees look at a wall 2 units ahead, of which they see 4 units each."""
 
-    def at(x, name):
-        pose = np.eye(4)
-        pose[0, 3] = -x
-        return replace(pinhole_view((200, 200), np.pi / 2, pose), name=name)
-
     wall = SimpleNamespace(depth=lambda view: np.full((view.height, view.width), 2.0, np.float32))
-    photographs = [at(0.0, "a.jpg"), at(1.0, "b.jpg")]
-    between = [at(x, f"{x}.png") for x in (0.0, 0.4, 1.0)]
+    photographs = [_at(0.0, "a.jpg"), _at(1.0, "b.jpg")]
+    between = [_at(x, f"{x}.png") for x in (0.0, 0.4, 1.0)]
     assert guessed_findings(wall, between, photographs) == []
-    (found,) = guessed_findings(wall, [*between, at(1.1, "c.png"), at(3.0, "d.png")], photographs)
+    (found,) = guessed_findings(wall, [*between, _at(1.1, "c.png"), _at(3.0, "d.png")], photographs)
     assert (found.kind, found.subjects) == ("guessed-frames", ("d.png",))
     assert "1 of 5 frames" in found.text
     assert "50% (d.png)" in found.text  # of its 4 units 2 are seen from 1.0
-    assert guessed_findings(wall, [at(3.0, "d.png")], 17 * photographs[:1]) == []
-    assert guessed_findings(wall, [at(3.0, "d.png")], []) == []
+    assert guessed_findings(wall, [_at(3.0, "d.png")], []) == []
+
+
+def test_of_many_photographs_the_nearest_show_most_frames():
+    rendered = []
+
+    def depth(view):
+        rendered.append(view.camera.center[0])
+        return np.full((view.height, view.width), 2.0, np.float32)
+
+    model = SimpleNamespace(depth=depth)
+    photographs = [_at(0.5 * i, f"{i}.jpg") for i in np.random.default_rng(0).permutation(200)]
+    assert guessed_findings(model, [_at(40.24, "a.png"), _at(60.0, "b.png")], photographs) == []
+    assert sorted(rendered) == pytest.approx([40.0, 40.24, 40.5, 60.0, 60.0])
+    (found,) = guessed_findings(model, [_at(101.5, "c.png")], photographs)
+    assert "50% (c.png)" in found.text  # the last is at 99.5
+    assert len(rendered) == 5 + 1 + 200  # each once

@@ -48,7 +48,7 @@ HELP = "See splatseed bench --help."
 SHARED = tuple(
     setting.name
     for setting in fields(TrainSettings)
-    if setting.name not in {"strategy", "seed", "seeding", "start"}
+    if setting.name not in {"strategy", "seed", "seeding", "region", "start"}
 )
 """Training settings that all runs of a plan share; the arm and the repeat set the others."""
 _SCENE_KEY = ("name", "digest", "depth_digest", "cloud_digest")

@@ -11,19 +11,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from splatseed.commands.next_steps import after_depth, show_maps
+from splatseed.commands.next_steps import after_depth, excluding, show_maps
 from splatseed.commands.options import check_minimum, parse_options, refuse
 from splatseed.console import OUT, add_results, print_next, print_note, print_pairs, stage_display
 from splatseed.depth.stereo.maps import MIN_SIZE
 from splatseed.depthmap import DepthKind
 from splatseed.findings import Finding, without_kinds
 from splatseed.io import dense, load_scene
+from splatseed.io.exclusion import exclude
 from splatseed.io.photograph_checks import with_photographs
+from splatseed.io.seeds import facts_for_reading
 from splatseed.io.staging import check_output
 from splatseed.requirements import require, versions_of
 from splatseed.scene import Scene
 from splatseed.seeding.advice import is_distorted
 from splatseed.text import name_some, quoted, visible
+from splatseed.training.request import ExcludeChoice
 
 if TYPE_CHECKING:  # stereo is loaded after the options are parsed
     from splatseed.depth.stereo import StereoMap
@@ -46,6 +49,8 @@ class Options:
     """A scene with photographs."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The folder of maps to write: one float32 .npy per image."""
+    exclude: ExcludeChoice = ()
+    """Photographs to leave out: a name, a pattern such as 'IMG_00*', or a .txt file of these."""
     model: Annotated[str | None, tyro.conf.arg(metavar="NAME|PATH")] = None
     """A depth network to run instead of stereo: a folder in transformers' format, or an id in
     Hugging Face's cache."""
@@ -89,7 +94,7 @@ def _provenance(options: Options) -> dict[str, object]:
 def _run_network(options: Options, model: str) -> None:
     with stage_display() as clock:
         clock("read", 0.0)
-        scene = load_scene(options.scene, require_points=False)
+        scene = exclude(load_scene(options.scene, require_points=False), options.exclude)
         clock("load network", 0.0)
         from splatseed.depth.monocular import estimate_depths, load_network
 
@@ -118,7 +123,8 @@ def _run_network(options: Options, model: str) -> None:
         text = f"the network predicted no depth (a constant map, or none) for: {flat}"
         print_note(Finding("no-depth", text, subjects=tuple(report.flat)))
     known = num * min(math.prod(size) for size in sizes)
-    print_next(after_depth(options.scene, scene, options.output, known, aligned=False))
+    commands = after_depth(options.scene, scene, options.output, known, aligned=False)
+    print_next(excluding(commands, options.scene, options.exclude))
 
 
 def _run_stereo(options: Options) -> None:
@@ -128,7 +134,7 @@ def _run_stereo(options: Options) -> None:
     start = time.perf_counter()
     with stage_display() as clock:
         clock("read", 0.0)
-        scene = load_scene(options.scene, require_points=False)
+        scene = exclude(load_scene(options.scene, require_points=False), options.exclude)
         scene = with_photographs(scene) if scene.images else scene
         if options.colmap:
             dense.check_dense_scene(scene, undistorts=True)
@@ -136,7 +142,7 @@ def _run_stereo(options: Options) -> None:
         maps = stereo_depths(scene, progress=clock, **size)
         how: dict[str, Any] = {
             "overwrite": options.overwrite,
-            "provenance": _provenance(options),
+            "provenance": {**_provenance(options), **facts_for_reading(scene)},
             "progress": clock,
         }
         if options.colmap:
@@ -178,7 +184,8 @@ def _summarise_stereo(
         text += "photographs: --colmap writes both, as a scene to continue with"
         print_note(Finding("lens-distortion", text, "info"))
     known = report.num_known
-    print_next(after_depth(options.scene, scene, path, known, aligned=True))
+    commands = after_depth(options.scene, scene, path, known, aligned=True)
+    print_next(excluding(commands, options.scene, options.exclude))
 
 
 def _size_range(sizes: Sequence[Sequence[int]]) -> str:

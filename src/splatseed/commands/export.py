@@ -14,6 +14,7 @@ from splatseed.commands.options import check_free, parse_options, refuse
 from splatseed.console import add_results, print_next, print_note, print_pairs, stage_display
 from splatseed.errors import InputError, ParameterError
 from splatseed.findings import Finding
+from splatseed.io.exclusion import EXCLUDED
 from splatseed.io.matrices import parse_similarity
 from splatseed.io.origin import RECENTER, choose_origin, format_offset, offset_beside, write_offset
 from splatseed.io.regions import REGION_FORM, Region, parse_region
@@ -36,6 +37,7 @@ from splatseed.splat.selection import (
 )
 from splatseed.text import counted, quoted, visible
 from splatseed.training.folder import RunFolder, config_of, model_file
+from splatseed.training.request import ExcludeChoice
 from splatseed.training.settings import TrainSettings
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
@@ -64,6 +66,9 @@ class Options:
     scene: Path | None = None
     """The scene of a file of Gaussians, for --budget and the score that the format costs; a run has
     its own."""
+    exclude: ExcludeChoice = ()
+    """Photographs of the scene to leave out: a name, a pattern such as 'IMG_00*', or a .txt file of
+    these."""
     crop: Annotated[str | None, tyro.conf.arg(metavar=REGION_FORM)] = None
     """Keep the Gaussians whose centres lie in this box, sphere (centre, radius), or turned box (a
     file or 16 numbers: the matrix from a cube of side 1 around 0), in the model's coordinates;
@@ -175,6 +180,12 @@ def _checked(options: Options) -> _Job:
         (page and transform is not None, "--transform for a file of Gaussians", "a web page",
          "A page shows the model in its scene's frame: leave it out."),
     )  # fmt: skip
+    compared = cleans or options.budget is not None or name != LOSSLESS
+    refuse(
+        (options.exclude and (scene is None or not compared),
+         "--exclude where photographs of a scene are compared", "a model alone",
+         f"Leave it out; --clean, --budget and formats other than .{LOSSLESS} compare them."),
+    )  # fmt: skip
     if cleans or page:  # a page's harmonics are turned
         require("torch")
     if named and options.budget is not None:
@@ -207,13 +218,19 @@ def _views(job: _Job, gaussians: Gaussians, progress: Progress, note: Note) -> M
     from splatseed.training.model_views import find_model_views
 
     try:
-        return find_model_views(job.path, gaussians, job.scene, job.config, progress)
+        views = find_model_views(
+            job.path, gaussians, job.scene, job.config, progress, job.options.exclude
+        )
     except InputError as error:
         if named:
             raise
         text = f"The model is not compared with the photographs of {job.scene}: {error}"
         note(Finding("scene-not-used", text, "info"))
         return None
+    for each in views.scene.findings:
+        if each.kind == EXCLUDED:
+            note(each)
+    return views
 
 
 def _kept(
@@ -228,8 +245,9 @@ def _kept(
 
         masks = job.config.get("masks")
         bad = floaters_of_model(
-            job.path, Path(str(job.scene)), masks=masks, progress=progress, **_split(job)
-        )
+            job.path, Path(str(job.scene)), masks=masks, excluded=options.exclude,
+            progress=progress, **_split(job),
+        )  # fmt: skip
         rows.append(("floaters", f"{np.count_nonzero(bad):,} left out"))
         keep &= ~bad
     if options.drop_isolated:
@@ -415,6 +433,7 @@ def _scoring_command(job: _Job) -> str:
     own = options.clean in {None, OWN} and options.scene is None
     if config.get("masks") is not None and own:
         words += ["--masks", quoted(config["masks"])]
+    words += [f"--exclude {quoted(each)}" for each in options.exclude]
     background = None if config else background_of(job.path)
     if background is not None and background != BLACK:
         words += ["--background", name_background(background)]

@@ -21,6 +21,7 @@ from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.similarity import Similarity
 from splatseed.training.folder import model_file
+from splatseed.training.request import ExcludeChoice
 from splatseed.training.settings import Backend
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
@@ -59,6 +60,9 @@ class Options:
     of a scene (a COLMAP model, a transforms.json, ...), in the world of the model's scene;
     graphdeco's cameras.json or a camera path, in the world of the model's file. A folder as output
     gets a PNG of each camera's name."""
+    exclude: ExcludeChoice = ()
+    """Photographs whose cameras are left out, of --cameras or else of the model's scene: a name, a
+    pattern such as 'IMG_00*', or a .txt file of these."""
     transform: Annotated[str | None, tyro.conf.arg(metavar="FILE|gsplat|flipped|none")] = None
     """Transform from the scene's world to the path's or the cameras', if that is not the model's:
     the dataparser_transforms.json of nerfstudio's run, or other values of evaluate --transform;
@@ -160,16 +164,13 @@ def run(arguments: list[str]) -> None:
             videos.write_video(options.output, pictures(), size, flight.fps)
         else:
             videos.write_pictures(options.output, pictures(), names, overwrite=options.overwrite)
+        guessed = videos.guessed_findings(renderers[0], views, items[0].train_views, clock)
     _summarise(options, flight, clock.seconds().get("render", 0.0))
-    print_note(*(finding for item in items for finding in item.findings))
-    print_note(*flight.findings)
+    print_note(*(finding for item in items for finding in item.findings), *flight.findings)
     if path is not None:
         size = views[0].width, views[0].height
         print_note(*path.findings(size, len(models[0]), len(items[0].model)))
-    print_note(
-        *videos.unseen_findings(shown, names),
-        *videos.guessed_findings(renderers[0], views, items[0].train_views),
-    )
+    print_note(*videos.unseen_findings(shown, names), *guessed)
     if items[0].moved and flight.given and not flight.given.of_scene and options.transform is None:
         text = f"{options.file} is taken to be in the model's frame, too, and was transformed with "
         text += "it; for the scene's frame, pass --transform none."
@@ -203,8 +204,13 @@ def _open_models(options: Options) -> list[ViewerItem]:
     scene = options.scene
     if scene is None and options.cameras and is_scene(options.cameras):
         scene = None if options.model.is_dir() else options.cameras  # a run has its own
+    refuse(
+        (options.exclude and options.file and not is_scene(options.file),
+         "--exclude with cameras of a scene", options.file, "Leave one of them out."),
+    )  # fmt: skip
+    excluded = () if options.cameras else options.exclude
     named = zip(unique_names(paths), paths, strict=True)
-    items = [replace(open_item(path, scene), name=name) for name, path in named]
+    items = [replace(open_item(path, scene, excluded), name=name) for name, path in named]
     fix = "Train it first (splatseed train), or view it with splatseed view."
     for path, item in zip(paths, items, strict=True):
         untrained = item.gaussians is None
@@ -241,7 +247,7 @@ def _flight(options: Options, item: ViewerItem) -> _Flight:
     chosen, cameras = _chosen_size(options), item.central_views
     size = next((even_size(v.width, v.height, DEFAULT_SIDE) for v in cameras), WITHOUT_CAMERAS)
     if options.cameras is not None:
-        given = read_cameras(options.cameras, item.scene)
+        given = read_cameras(options.cameras, item.scene, options.exclude)
         sizes = {(view.width, view.height) for view in given.views}
         refuse(
             (options.is_video and chosen is None and len(sizes) > 1,

@@ -6,19 +6,26 @@ With ``--json``, lengths are in scene units, and five numbers are percentiles 5,
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
 
-from splatseed.camera import Intrinsics
 from splatseed.commands import next_steps
 from splatseed.commands.capture_check import CaptureCheck, PoseCheck, check_capture
-from splatseed.commands.next_steps import Commands, Planned, TrainerName
+from splatseed.commands.info_rows import (
+    advice_rows,
+    cloud_rows,
+    depth_map_rows,
+    photograph_rows,
+    scene_facts,
+    source_rows,
+    track_rows,
+)
+from splatseed.commands.next_steps import Commands, Planned, TrainerName, excluding
 from splatseed.commands.options import check_free, parse_options, refuse
 from splatseed.console import (
     OUT,
@@ -45,8 +52,8 @@ from splatseed.scene import Scene
 from splatseed.seeding import diagnostics
 from splatseed.seeding.advice import Advice, advice_for, is_distorted, untrainable
 from splatseed.seeding.clouds.point_colors import missing_color_findings
-from splatseed.seeding.photo_methods import Auto, photographed
-from splatseed.text import counted, quoted, visible
+from splatseed.seeding.photo_methods import photographed
+from splatseed.text import quoted, visible
 from splatseed.training.folder import RunFolder
 from splatseed.training.request import ExcludeChoice
 from splatseed.training.schedule import FULL_RUN
@@ -54,8 +61,6 @@ from splatseed.training.schedule import FULL_RUN
 if TYPE_CHECKING:  # Numba, which takes a while to load, comes with it
     from splatseed.depth.alignment import Alignment
 
-KINDS_SHOWN = 3
-"""Kinds of cameras listed; collections of photographs from the web have one per photograph."""
 IMAGES_SHOWN = 12
 """Images whose depth is listed."""
 
@@ -164,7 +169,7 @@ def _add_results(scene: Scene, facts: _Facts, advice: Advice, planned: Planned) 
         for texts in (facts.problems, () if first else advice.reasons)
     )
     add_results(
-        **_facts_of(scene), verdict=facts.verdict(scene), checkup=facts.check.facts,
+        **scene_facts(scene), verdict=facts.verdict(scene), checkup=facts.check.facts,
         points=facts.cloud, tracks=facts.tracks, empty=facts.regions,
         poses=poses and poses.facts, masks=facts.masks, depth_map_statistics=facts.maps,
         depth=facts.alignments, problems=problems, planned=planned.facts, reasons=reasons,
@@ -178,11 +183,11 @@ def _show(options: Options, scene: Scene, facts: _Facts) -> None:
     planned = Planned.of(usable, options.budget, options.max_steps, options.trainer)
     advice = _advice(usable, planned, facts)
     OUT.print(facts.verdict(scene), style="bold", soft_wrap=True)
-    rows = [*_source_rows(scene), *_depth_map_rows(facts.maps, facts.beside)]
-    rows += [*_cloud_rows(facts.cloud), *_track_rows(facts.tracks)]
-    rows += [*check.rows, *_photograph_rows(facts.regions, check.poses, facts.masks)]
+    rows = [*source_rows(scene), *depth_map_rows(facts.maps, facts.beside)]
+    rows += [*cloud_rows(facts.cloud), *track_rows(facts.tracks)]
+    rows += [*check.rows, *photograph_rows(facts.regions, check.poses, facts.masks)]
     if len(scene.points):
-        rows += [("advice", check.first)] if check.first else _advice_rows(advice, planned)
+        rows += [("advice", check.first)] if check.first else advice_rows(advice, planned)
     _add_results(scene, facts, advice, planned)
     print_pairs(str(options.scene), rows)
     if facts.alignments is not None:
@@ -196,16 +201,7 @@ def _show(options: Options, scene: Scene, facts: _Facts) -> None:
         commands = _next(options, usable, advice, planned, facts.known, check.poses)
         if check.first and len(scene.points):
             commands = [("once that is mended", f"splatseed info {quoted(options.scene)}")]
-        print_next(_excluding(commands, options.exclude))
-
-
-def _excluding(commands: Commands, patterns: Sequence[str]) -> Commands:
-    """Add ``--exclude`` to the commands that read the scene's photographs."""
-    words = "".join(f" --exclude {quoted(pattern)}" for pattern in patterns)
-    verbs = tuple(
-        f"splatseed {verb} " for verb in ("info", "upsample", "train", "sfm", "undistort")
-    )
-    return [(label, f"{line}{words * line.startswith(verbs)}") for label, line in commands]
+        print_next(excluding(commands, options.scene, options.exclude))
 
 
 def _shows_model(options: Options) -> bool:
@@ -353,147 +349,6 @@ def _next(
     points = f"{points} --refine-poses" if refine else points
     maps = [("or from the maps", lifted)] if lifted and (known or metric) else []
     return [*advised, *maps, ("or points" if advised or maps else "points", points)]
-
-
-def _facts_of(scene: Scene) -> dict[str, Any]:
-    """Return the source and the contents of a scene, for ``--json``."""
-    train, test = scene.split(scene.default_test_every)
-    return {
-        "format": scene.source.format,
-        "root": str(scene.source.root),
-        "images": len(scene.images),
-        "train_images": len(train),
-        "test_images": len(test),
-        "photographs": scene.has_photographs,
-        "few_photographs": _has_pixel_seeds(scene),
-        "cameras": [
-            {"id": c.camera_id, "model": c.model, "width": c.width, "height": c.height}
-            for c in _cameras(scene)
-        ],
-        "depth_maps": 0 if scene.depths is None else len(scene.depths),
-        "depth_maps_beside": len(depths_beside(scene) or ()),
-    }
-
-
-def _cameras(scene: Scene) -> list[Intrinsics]:
-    """Return all cameras, in pixels of their photographs, in the order of their records."""
-    used: dict[int, dict[Intrinsics, None]] = {}
-    for image in scene.images:
-        used.setdefault(image.lens.camera_id, {})[image.lens] = None
-    return [c for record in scene.intrinsics for c in used.get(record.camera_id, (record,))]
-
-
-def _source_rows(scene: Scene) -> list[tuple[str, str]]:
-    sizes = Counter(f"{c.model} {c.width}x{c.height}" for c in _cameras(scene))
-    cameras = [f"{count:,} {kind}" for kind, count in sizes.most_common(KINDS_SHOWN)]
-    if len(sizes) > KINDS_SHOWN:
-        cameras.append(f"{len(sizes) - KINDS_SHOWN:,} more kinds")
-    train, test = scene.split(scene.default_test_every)
-    by = f", by its {scene.listed.origin}" if scene.listed else ""
-    images = f"{len(scene.images):,} ({len(train):,} to train, {len(test):,} to test{by})"
-    rows = [
-        ("format", scene.source.format),
-        ("cameras", ", ".join(cameras) or "none"),
-        ("images", images if scene.images else "none"),
-    ]
-    few = _has_pixel_seeds(scene)
-    if few is not False:
-        seeds = "method auto gives every second pixel a seed; docs/few_photographs.md"
-        rows.append(("few photographs", seeds if few else f"unless they are close, {seeds}"))
-    return rows
-
-
-def _has_pixel_seeds(scene: Scene) -> bool | None:
-    """Whether method auto takes the training photographs for few; None if it depends on seeds."""
-    if not scene.has_photographs:
-        return False
-    from splatseed.seeding.few_photographs import MAX_PHOTOGRAPHS
-
-    cameras = [image.camera for image in scene.split(scene.default_test_every)[0]]
-    if not 2 <= len(cameras) <= MAX_PHOTOGRAPHS:
-        return False
-    points = scene.points.originals
-    few = Auto().fills_pixels(scene, cameras, points.xyz[points.finite])
-    return few or (False if len(points) or Auto().uses_maps(scene) else None)
-
-
-def _depth_map_rows(
-    maps: diagnostics.DepthMapStatistics | None, beside: int
-) -> list[tuple[str, str]]:
-    if maps is None:
-        there = f"{beside:,} beside the photographs; method depth aligns them with the points"
-        return [("depth maps", there)] * (beside > 0)
-    size = f"{maps.num_maps:,} of {maps.width} x {maps.height} pixels"
-    if maps.confidence is not None:
-        low, medium, high = maps.confidence
-        size += f", of high confidence at {high:.0%}, medium {medium:.0%}, low {low:.0%}"
-    elif maps.known < 1:
-        size += f", with a depth at {maps.known:.0%}"
-    return [("depth maps", f"{size}; method auto uses them" if maps.in_scene_units else size)]
-
-
-def _cloud_rows(cloud: diagnostics.CloudStatistics) -> list[tuple[str, str]]:
-    rows = [("points", f"{cloud.num_points:,}"), ("not finite", f"{cloud.non_finite:,}")]
-    if cloud.num_points == cloud.non_finite:  # nothing to measure
-        return rows if cloud.num_points else [("points", "none")]
-    low, high = (" ".join(f"{x:.4g}" for x in corner) for corner in (cloud.low, cloud.high))
-    spacing = " ".join(f"{x:.4g}" for x in cloud.spacing if not math.isnan(x))
-    return [
-        *rows,
-        ("duplicates", f"{cloud.duplicates:,}"),
-        ("isolated", f"{cloud.isolated:,}"),
-        ("spacing 5/25/50/75/95%", spacing or "none"),
-        ("bounding box", f"{low}  to  {high}"),
-        ("float32 resolution", f"{cloud.resolution:.2g}"),
-    ]
-
-
-def _track_rows(tracks: diagnostics.TrackStatistics | None) -> list[tuple[str, str]]:
-    if tracks is None:
-        return [("tracks", "none")]
-
-    def summary(mean: float, percentiles: tuple[float, ...], style: str) -> str:
-        spread = " ".join(f"{x:{style}}" for x in percentiles)
-        return "unknown" if math.isnan(mean) else f"mean {mean:{style}}, 5/25/50/75/95% {spread}"
-
-    return [
-        ("track length, images", summary(tracks.mean_length, tracks.length, ".3g")),
-        ("reprojection error, px", summary(tracks.mean_error, tracks.error, ".3f")),
-    ]
-
-
-def _photograph_rows(
-    regions: diagnostics.EmptyRegions | None,
-    poses: PoseCheck | None,
-    masks: diagnostics.MaskStatistics,
-) -> list[tuple[str, str]]:
-    rows = []
-    if masks.images:
-        share = f"{masks.share:.0%} of their pixels, on average, do not count"
-        rows.append(("masks", f"of {counted(masks.images, 'photograph')}; {share}"))
-    if regions is not None:
-        worst = f"{regions.worst:.0%} in {regions.worst_name}"
-        grid = f"(of cells, {diagnostics.EMPTY_CELLS} along the longer side)"
-        rows.append(("image area without points", f"{regions.mean:.0%} on average, {worst} {grid}"))
-    if poses and (poses.error is not None or not poses.doubts):
-        from splatseed.checkup.poses import agreement_findings
-
-        few = bool(agreement_findings(poses.agreement))
-        agreed = f"at {poses.agreement:.0%} of the pixels compared: {'few' if few else 'enough'}"
-        error = poses.error
-        miss = "unknown: too few corners are found again" if error is None else error.verdict
-        rows += [("photographs agree", agreed), ("pose error", miss)]
-    return rows
-
-
-def _advice_rows(advice: Advice, planned: Planned) -> list[tuple[str, str]]:
-    """Return the advice, its reasons, and the training it is for."""
-    size = f" ({planned.rho})" if planned.rho else ""
-    plan = f"{planned.budget:,} Gaussians at most{size}, {planned.max_steps:,} steps, strategy"
-    rows = [("planned", f"{plan} {planned.strategy.name}"), ("advice", advice.sentence)]
-    if advice.measured.layout:
-        rows.insert(0, ("cameras stand", advice.measured.layout))
-    return rows + [("" if i else "why", reason) for i, reason in enumerate(advice.reasons)]
 
 
 def _print_depth(title: str, scene: Scene, alignments: Mapping[str, Alignment]) -> None:

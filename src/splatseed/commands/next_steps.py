@@ -236,6 +236,16 @@ def after_depth(path: Path, scene: Scene, maps: Path, known: int, *, aligned: bo
     return [looking, points, ("use", lifting_command(Path("SCENE"), maps, f"--ratio {RATIO}"))]
 
 
+def excluding(commands: Commands, path: Path, patterns: Sequence[str]) -> Commands:
+    """Add ``--exclude`` to the commands that read the scene at ``path``; others read outputs."""
+    words = "".join(f" --exclude {quoted(pattern)}" for pattern in patterns)
+    start, name = "splatseed ", f" {quoted(path)} "
+    return [
+        (label, line + words * (line.startswith(start) and name in f"{line} "))
+        for label, line in commands
+    ]
+
+
 def show_maps(path: Path, maps: Path) -> tuple[str, str]:
     """Return the command that shows depth maps."""
     picture = quoted(f"{maps.resolve().name}.png")

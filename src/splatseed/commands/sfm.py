@@ -58,10 +58,10 @@ class Options:
     """The scene folder to write: in metres, with x east, y north and z up, if GPS in the
     photographs' EXIF determines that."""
     poses_from: Path | None = None
-    """Triangulate points, in place of its own, for the poses and intrinsics of this scene."""
+    """Triangulate points for the poses and intrinsics of this scene, in place of its own."""
     refine_poses: bool = False
     """Refine the poses of --poses-from first, such as those of a phone or SLAM, which are off by a
-    degree or two."""
+    degree or two. Its points without tracks, such as LiDAR's, stay beside the triangulated."""
     exclude: ExcludeChoice = ()
     """Photographs to leave out: a name, a pattern such as 'IMG_00*', or a .txt file of these."""
     matcher: MatcherName = "auto"
@@ -158,7 +158,10 @@ def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmR
         stages = [*(["refinement"] if options.refine_poses else []), "triangulation"]
         poses = load_scene(options.poses_from, require_points=False)
         print_note(*(each for each in poses.findings if each.kind == "far-from-origin"))
-        how = {"poses_from": poses, "refine_poses": options.refine_poses}
+        from splatseed.seeding.clouds.point_colors import with_colors
+
+        color = partial(with_colors, test_every=0, note=print_note, progress=clock)
+        how = {"poses_from": poses, "refine_poses": options.refine_poses, "color": color}
     if poses is not None and poses.masks is not None and poses.masks.files:
         masks = poses.masks
     elif not video:
@@ -250,10 +253,11 @@ def _pose_error(report: SfmReport, clock: StageClock) -> PoseErrorEstimate | Non
 
 
 def _summarise(options: Options, report: SfmReport, error: PoseErrorEstimate | None) -> None:
+    kept = f", {report.num_kept:,} of them the given scene's" if report.num_kept else ""
     rows = [
         ("pairs matched", f"{report.num_pairs:,} of {math.comb(report.total, 2):,}"),
         ("images with a pose", f"{report.registered} of {report.total}"),
-        ("points", f"{report.num_points:,}"),
+        ("points", f"{report.num_points:,}{kept}"),
         ("track length", f"mean {report.mean_track_length:.2f} images"),
         ("reprojection error", f"mean {report.mean_reprojection_error:.3f} px"),
         ("pose error", "unknown" if error is None else error.verdict),

@@ -61,7 +61,12 @@ MIN_REPORTED = 120.0
 RUN_FACTS = {"splatseed", "points", "photographs", "split", "dropped", "excluded", "mask_files",
     "device", "versions", "near_plane", "frame"}  # fmt: skip
 """Keys of config.json that are not options."""
-EXCLUSIVE = (("start", "seeding"), ("start", "refine_poses"), ("long_side", "data_factor"))
+EXCLUSIVE = (
+    ("start", "seeding"),
+    ("start", "refine_poses"),
+    ("start", "region"),
+    ("long_side", "data_factor"),
+)
 """Pairs of exclusive options: one on the command line replaces the other of a file."""
 DEFAULT = TrainRequest()
 NESTED = {"request", "settings", "named"}

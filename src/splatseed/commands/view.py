@@ -28,6 +28,7 @@ from splatseed.runtime.interruption import Termination, exit_code
 from splatseed.splat.formats import SUFFIXES
 from splatseed.text import counted, visible
 from splatseed.training.folder import RunFolder
+from splatseed.training.request import ExcludeChoice
 from splatseed.training.settings import Backend
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
@@ -48,6 +49,9 @@ class Options:
     """A second item to show side by side, from the same camera."""
     scene: Path | None = None
     """The scene of a file of Gaussians; a run has its own."""
+    exclude: ExcludeChoice = ()
+    """Photographs of the scene to leave out: a name, a pattern such as 'IMG_00*', or a .txt file of
+    these."""
     host: str = "127.0.0.1"
     """The address to listen on: this machine alone, or 0.0.0.0 for all that can reach it."""
     port: int = 8080
@@ -104,7 +108,9 @@ def _open_items(options: Options) -> tuple[list[ViewerItem], int | None]:
         paths |= compared
         second = list(paths).index(next(iter(compared)))
     named = zip(unique_names(list(paths.values())), paths.values(), strict=True)
-    return [replace(open_item(path, options.scene), name=name) for name, path in named], second
+    return [
+        replace(open_item(path, options.scene, options.exclude), name=name) for name, path in named
+    ], second
 
 
 def _items_in(path: Path) -> list[Path]:

@@ -16,8 +16,9 @@ from jaxtyping import Bool, Int64
 from splatseed.findings import Finding
 from splatseed.io.colmap import check_tracks
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import NO_POINT, Image, LeftOut, Observations, Scene, Tracks
+from splatseed.scene import Image, LeftOut, Scene
 from splatseed.text import agreeing, counted
+from splatseed.tracks import NO_POINT, Observations, Tracks
 
 _FAR_OUT = 1e4
 """Interquartile extents from which points are outliers; skies are at some hundred."""

@@ -30,7 +30,8 @@ from splatseed.io.camera_records import (
 )
 from splatseed.io.files import ByteReader, StrPath, is_data, numbered_lines
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import NO_POINT, Image, Observations, Tracks
+from splatseed.scene import Image
+from splatseed.tracks import NO_POINT, Observations, Tracks
 
 UNKNOWN_ERROR = -1.0
 """COLMAP's reprojection error of a point without one."""

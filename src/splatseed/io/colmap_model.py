@@ -29,8 +29,9 @@ from splatseed.io.photograph_checks import photograph_findings
 from splatseed.io.ply import read_ply_float64
 from splatseed.io.point_files import differing_points, first_with_points
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import OPENCV, Image, Scene, SceneSource, Tracks
+from splatseed.scene import OPENCV, Image, Scene, SceneSource
 from splatseed.text import counted
+from splatseed.tracks import Tracks
 
 IMAGE_DIRS = ("images", "images_2", "images_4", "images_8", "image", "input")
 _MODEL_FILES = ("cameras", "images", "points3D")

@@ -33,7 +33,8 @@ from splatseed.lens import unproject_pixels
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.projection import denormalized, normalized, pixel_centers
-from splatseed.scene import Image, Observations, Scene, Tracks
+from splatseed.scene import Image, Scene
+from splatseed.tracks import Observations, Tracks
 
 DenseMap: TypeAlias = Any
 """A ``splatseed.depth.stereo.StereoMap`` of one image."""

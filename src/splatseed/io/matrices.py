@@ -7,18 +7,23 @@ Notation: a matrix of 3 or 4 rows of 4 numbers takes old to new coordinates, x -
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
-from splatseed.errors import ParameterError
-from splatseed.io.files import read_bytes
-from splatseed.similarity import Similarity
+from splatseed.errors import ParameterError, SceneFormatError
+from splatseed.io.files import StrPath, read_bytes, read_json
+from splatseed.scene import Scene
+from splatseed.similarity import Similarity, similarity_of
 
 _KEYS = ("transform", "matrix", "transform_matrix", "transformation")
 """Names under which programs store a matrix in JSON; nerfstudio's ``transform`` has a scale."""
+_FIX = "Write 3 or 4 rows of 4 numbers, as text or JSON."
+NERFSTUDIO = "dataparser_transforms.json"
+"""The file in which nerfstudio records how it moved a scene."""
 _TOLERANCE = 1e-3
 """Largest relative difference of the three scales of a similarity."""
 
@@ -111,3 +116,53 @@ def parse_similarity(text: str, name: str = "transform") -> Similarity:
         found=fault,
         fix="Harmonics and rotations of Gaussians follow no other transform.",
     )
+
+
+def read_cloud_transform(path: StrPath, scene: Scene) -> Similarity:
+    """Read a similarity from a cloud's frame to the scene's; else raise ``SceneFormatError``.
+
+    Nerfstudio's file maps the scene to the world in which it trains and exports, so for a cloud
+    exported there the inverse is returned.
+    """
+    path = Path(path)
+    with suppress(ValueError):  # not plain numbers
+        rows = np.loadtxt(read_bytes(path).decode("utf-8").splitlines(), np.float64, ndmin=2)
+        return similarity_in(path, rows.tolist(), scene, _FIX)
+    content = read_json(path, "a transform, as text or JSON", fix=_FIX)
+    found = similarity_in(path, content, scene, _FIX)
+    return found.inverse if path.name == NERFSTUDIO else found
+
+
+def similarity_in(path: Path, content: Any, scene: Scene, fix: str) -> Similarity:
+    """Parse a similarity: the rows of a matrix, or a mapping with a matrix and a scale.
+
+    Nerfstudio's file, recognised by its name, maps from COLMAP's own world; for a scene read from
+    transforms.json, the inverse of ``applied_transform`` is applied first. Raises
+    ``SceneFormatError`` with this ``fix`` if the content is no similarity.
+    """
+    scale, rows = 1.0, content
+    if isinstance(content, dict):
+        rows = next((content[key] for key in _KEYS if key in content), None)
+        # Beside other matrices it repeats the matrix's own scale, as in alignment.json.
+        scale = content.get("scale", 1.0) if "transform" in content else 1.0
+    try:
+        matrix = np.atleast_1d(np.array(rows, np.float64))
+        matrix = np.concatenate([matrix[:3] * float(scale), np.eye(4)[3:]])
+        transforms = scene.source.transforms_path
+        if path.name == NERFSTUDIO and transforms is not None:
+            applied = read_json(transforms, fix=fix).get("applied_transform")
+            applied = np.eye(4) if applied is None else np.array(applied, np.float64)
+            applied = np.vstack([applied[:3], np.eye(4)[3:]])
+            matrix = matrix @ np.linalg.inv(applied)
+        world = similarity_of(matrix)
+    except (TypeError, ValueError, OverflowError):
+        world = None
+    if world is None:
+        expected = (
+            f"{path} to hold a similarity (rotation, shift and one scale; no shear, no mirror): 3"
+            " or 4 rows of 4 numbers, by themselves or as transform, with a scale beside them"
+        )
+        found = repr(rows)
+        found = found if len(found) <= 80 else f"{found[:77]}..."
+        raise SceneFormatError(expected, found=found, fix=fix)
+    return world

@@ -1,4 +1,4 @@
-"""Scenes in ``transforms.json`` (nerfstudio, instant-ngp, Blender data sets); similarity files.
+"""Scenes in ``transforms.json`` (nerfstudio, instant-ngp, Blender data sets).
 
 A *frame* is one posed image; its ``transform_matrix`` is ``world_from_cam`` in OpenGL axes (x
 right, y up, z back). The *transforms' space* is the world frame of these poses;
@@ -41,7 +41,6 @@ from splatseed.io.files import (
     StrPath,
     absolute,
     open_file,
-    read_bytes,
     read_json,
     special_kind,
     translate_errors,
@@ -63,7 +62,7 @@ from splatseed.io.ply import read_ply_float64
 from splatseed.io.point_files import differing_points
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import OPENGL, Image, Masks, Scene, SceneSource, Split
-from splatseed.similarity import Similarity, fit_similarity, similarity_of
+from splatseed.similarity import fit_similarity
 from splatseed.text import counted
 
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
@@ -79,9 +78,6 @@ _MAX_PIXELS = 1e9
 _FOCAL_LENGTHS = {a: frozenset({f"{a}_fov", f"fl_{a}", f"camera_angle_{a}"}) for a in "xy"}
 """Keys of which any states a focal length."""
 _CONVENTION = f"each transform_matrix is world_from_cam, {OPENGL}"
-NERFSTUDIO = "dataparser_transforms.json"
-_MATRIX_KEYS = ("transform", "matrix", "transform_matrix", "transformation")
-_MATRIX_FIX = "Write 3 or 4 rows of 4 numbers, as text or JSON."
 _BLENDER = ("transforms_train.json", "transforms_test.json")
 _POINT_FILES = ("sparse_pc.ply", "points3d.ply", "points3D.ply", "pointcloud.ply")
 _LEGACY_TRANSFORM = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
@@ -501,53 +497,3 @@ def pair_centers(named: Named, others: Named) -> list[tuple[Center, Center]]:
 
 def _stem(name: str) -> str:
     return PurePath(name).stem
-
-
-def read_cloud_transform(path: StrPath, scene: Scene) -> Similarity:
-    """Read a similarity from a cloud's frame to the scene's; else raise ``SceneFormatError``.
-
-    Nerfstudio's file maps the scene to the world in which it trains and exports, so for a cloud
-    exported there the inverse is returned.
-    """
-    path = Path(path)
-    with suppress(ValueError):  # not plain numbers
-        rows = np.loadtxt(read_bytes(path).decode("utf-8").splitlines(), np.float64, ndmin=2)
-        return similarity_in(path, rows.tolist(), scene, _MATRIX_FIX)
-    content = read_json(path, "a transform, as text or JSON", fix=_MATRIX_FIX)
-    found = similarity_in(path, content, scene, _MATRIX_FIX)
-    return found.inverse if path.name == NERFSTUDIO else found
-
-
-def similarity_in(path: Path, content: Any, scene: Scene, fix: str) -> Similarity:
-    """Parse a similarity: the rows of a matrix, or a mapping with a matrix and a scale.
-
-    Nerfstudio's file, recognised by its name, maps from COLMAP's own world; for a scene read from
-    transforms.json, the inverse of ``applied_transform`` is applied first. Raises
-    ``SceneFormatError`` with this ``fix`` if the content is no similarity.
-    """
-    scale, rows = 1.0, content
-    if isinstance(content, dict):
-        rows = next((content[key] for key in _MATRIX_KEYS if key in content), None)
-        # Beside other matrices it repeats the matrix's own scale, as in alignment.json.
-        scale = content.get("scale", 1.0) if "transform" in content else 1.0
-    try:
-        matrix = np.atleast_1d(np.array(rows, np.float64))
-        matrix = np.concatenate([matrix[:3] * float(scale), np.eye(4)[3:]])
-        transforms = scene.source.transforms_path
-        if path.name == NERFSTUDIO and transforms is not None:
-            applied = read_json(transforms, fix=fix).get("applied_transform")
-            applied = np.eye(4) if applied is None else np.array(applied, np.float64)
-            applied = np.vstack([applied[:3], np.eye(4)[3:]])
-            matrix = matrix @ np.linalg.inv(applied)
-        world = similarity_of(matrix)
-    except (TypeError, ValueError, OverflowError):
-        world = None
-    if world is None:
-        expected = (
-            f"{path} to hold a similarity (rotation, shift and one scale; no shear, no mirror): 3"
-            " or 4 rows of 4 numbers, by themselves or as transform, with a scale beside them"
-        )
-        found = repr(rows)
-        found = found if len(found) <= 80 else f"{found[:77]}..."
-        raise SceneFormatError(expected, found=found, fix=fix)
-    return world

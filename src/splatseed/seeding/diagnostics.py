@@ -21,7 +21,8 @@ from splatseed.photos.view import surface_pixels
 from splatseed.photos.visibility import points_in_image
 from splatseed.progress import Progress, silent
 from splatseed.sampling import strided
-from splatseed.scene import NO_POINT, Image, Scene
+from splatseed.scene import Image, Scene
+from splatseed.tracks import NO_POINT
 
 EMPTY_CELLS = 32  # cells of the grid of empty regions along an image's longer side
 MIN_UNMASKED = 0.5  # minimum fraction of a cell's pixels that count for the cell to count

@@ -13,7 +13,8 @@ or 4047 points. With ``threads=1`` the output is bit-identical. On a GPU nothing
 
 from splatseed.sfm.colmap import MatcherName, Settings
 from splatseed.sfm.own_points import points_without_tracks, with_refined
-from splatseed.sfm.pipeline import RefinedScene, SfmReport, reconstruct, refined, undistort
+from splatseed.sfm.pipeline import SfmReport, reconstruct, undistort
+from splatseed.sfm.refined_scene import RefinedScene, refined
 from splatseed.sfm.refinement import Refinement
 
 __all__ = [

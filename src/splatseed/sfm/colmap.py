@@ -10,7 +10,7 @@ import math
 import time
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar, get_args
 
@@ -25,7 +25,7 @@ from splatseed.progress import Progress
 from splatseed.requirements import install_command
 from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Image
-from splatseed.sfm.cameras import SharedCamera
+from splatseed.sfm.cameras import Photos, SharedCamera
 from splatseed.sfm.panoramas import PanoramaRig
 from splatseed.sfm.photos import COPIES
 from splatseed.sfm.work_folder import DATABASE, WorkFolder
@@ -37,6 +37,7 @@ T = TypeVar("T")
 _MIN_VERSION = 4  # the first that adds an image with its rig in one call
 _MAX_INT = 2**31 - 1  # pycolmap takes a 32-bit int
 _POLL_SECONDS = 0.1
+_LARGE = 1600  # px; longer sides of photographs whose features suffice without doubling
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,20 @@ class Settings:
                 raise errors.ParameterError(
                     f"`{name}` from {low} to {_MAX_INT}", found=f"{value}", fix="Choose another."
                 )
+
+    def for_poses(self, photos: Photos) -> Settings:
+        """Return settings for estimating or refining poses; sizes that the caller chose stay.
+
+        Large photographs are not doubled but used at up to 2,000 px: the pose error of 40 of a
+        phone's of 1,920 px, refined, and of 97 of 1,800 px is the same, in a third of the time, by
+        0.44 of the features or points.
+        """
+        chosen = (self.max_image_size, self.doubled)
+        longer_sides = [max(photo.size) for photo in photos.values()]
+        default = (Settings.max_image_size, Settings.doubled)
+        if chosen == default and np.median(longer_sides) >= _LARGE:
+            return replace(self, max_image_size=2000, doubled=False)
+        return self
 
 
 def check_choice(name: str, value: str, choices: Sequence[str]) -> None:

@@ -10,12 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from splatseed.checkup.choices import UnfitPoints
 from splatseed.findings import Finding
+from splatseed.io.colmap import read_points3d, write_points3d
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Image, LeftOut, Scene
@@ -23,6 +25,8 @@ from splatseed.scene import Image, LeftOut, Scene
 if TYPE_CHECKING:  # Numba, for which --help would wait, comes with it
     from splatseed.checkup.consistency import Fit
 
+Color: TypeAlias = Callable[[Scene], Scene]
+"""Gives colours to a scene's points where they lack them."""
 _MOVED = "transformed-points"
 _LESS = 0.05
 """Smallest fall of the share of points that photographs confirm that is reported as a loss."""
@@ -59,6 +63,32 @@ def points_without_tracks(scene: Scene) -> PointCloud:
     return scene.points.select(without)
 
 
+def unchanged(scene: Scene) -> Scene:
+    """Return the scene as it is, where no colours are wanted."""
+    return scene
+
+
+def add_own_points(
+    model_dir: Path, scene: Scene, refined: Sequence[Image], progress: Progress, color: Color
+) -> tuple[int, tuple[Finding, ...]]:
+    """Add the scene's points without tracks to a COLMAP model, where they stay as ``points_kept``.
+
+    Returns their number, and how photographs fit them if poses changed.
+    """
+    own, fits = scene.with_points(points_without_tracks(scene)), tuple[Finding, ...]()
+    if not len(own.points):
+        return 0, ()
+    if all(map(_same_pose, scene.images, refined)):
+        kept = color(own).points
+    else:
+        kept, fits = points_kept(scene, refined, "drop", progress, test_every=0, color=color)
+    path = model_dir / "points3D.bin"
+    points, tracks = read_points3d(path)
+    joined = PointCloud.concatenate(points, PointCloud(kept.xyz, kept.rgb))
+    write_points3d(path, joined, tracks)
+    return len(kept), fits
+
+
 def points_kept(
     scene: Scene,
     refined: Sequence[Image],
@@ -66,7 +96,7 @@ def points_kept(
     progress: Progress,
     *,
     test_every: int,
-    color: Callable[[Scene], Scene],
+    color: Color,
 ) -> tuple[PointCloud, tuple[Finding, ...]]:
     """Return the scene's own points that stay at refined poses, and how photographs fit them.
 
@@ -77,7 +107,7 @@ def points_kept(
         progress: Called with the stage and the fraction done.
         test_every: Every n-th photograph by name is a test view, and not compared; 0: those that
             the scene lists.
-        color: Gives colours to the points where they lack them.
+        color: Applied to the scene with points that stay.
     """
     from splatseed.checkup import examination  # noqa: PLC0415  (as above)
     from splatseed.checkup.consistency import Evidence  # noqa: PLC0415

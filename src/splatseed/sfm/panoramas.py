@@ -34,18 +34,10 @@ from splatseed.io.photograph import (
 )
 from splatseed.photos.panorama import FACES, cut_face, face_directions, face_features, face_lens
 from splatseed.progress import Progress, num_threads
-from splatseed.scene import (
-    TEST_EVERY,
-    Image,
-    Masks,
-    Observations,
-    Scene,
-    SceneSource,
-    Split,
-    Tracks,
-)
+from splatseed.scene import TEST_EVERY, Image, Masks, Scene, SceneSource, Split
 from splatseed.sfm.cameras import Photos
 from splatseed.text import agreeing, counted, name_some
+from splatseed.tracks import Observations, Tracks
 
 _MIN_TESTED = 4
 """Fewest panoramas of which every ``TEST_EVERY``-th tests: all faces of one or none, since they

@@ -1,26 +1,19 @@
-"""Run Structure-from-Motion: ``reconstruct``, ``undistort``, ``refined``.
+"""Run Structure-from-Motion: ``reconstruct``, ``undistort``.
 
-Input is checked and output staged here; pycolmap runs in a child process. COLMAP aborts its process
-on some failures (a full disk under SQLite, a broken image codec), and some of its loops only stop
-by a kill: an abort of the child becomes ``ReconstructionError``, and an interrupt kills it.
+Input is checked and output staged here; pycolmap runs in a child process (``child``).
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PurePosixPath
 from shutil import rmtree
-from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple, TypeAlias
-
-import numpy as np
+from typing import TypeAlias
 
 from splatseed import errors
 from splatseed.camera import CAMERA_MODELS, Intrinsics
-from splatseed.checkup.choices import UnfitPoints
 from splatseed.findings import Finding
 from splatseed.io import write_scene
 from splatseed.io.colmap_layout import write_lists, write_split
@@ -36,28 +29,26 @@ from splatseed.io.picture import find_white
 from splatseed.io.seeds import carry_seeds
 from splatseed.io.staging import MANIFEST, output_folder, write_json
 from splatseed.photos.sizes import at_file_size
-from splatseed.pointcloud import PointCloud
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.requirements import require, version_of
-from splatseed.runtime.child import Child
 from splatseed.scene import Image, Masks, Scene
 from splatseed.sfm import colmap
 from splatseed.sfm.cameras import (
     MIN_DISTORTION,
     MIN_FOCAL,
-    Photos,
     SharedCamera,
     default_model,
     describe_cameras,
     held_lens,
     share_cameras,
 )
+from splatseed.sfm.child import WORK, call
 from splatseed.sfm.colmap import ColmapRun, Settings
-from splatseed.sfm.export import drop_repeats, export_scene
+from splatseed.sfm.export import export_scene
 from splatseed.sfm.gps import GpsFrame, GpsPosition, align_to_gps
 from splatseed.sfm.mapping import map_images
 from splatseed.sfm.matching import match_further, match_photographs
-from splatseed.sfm.own_points import points_kept, with_refined
+from splatseed.sfm.own_points import Color, add_own_points, unchanged
 from splatseed.sfm.panoramas import (
     PanoramaRig,
     PanoramasName,
@@ -71,14 +62,11 @@ from splatseed.sfm.panoramas import (
 )
 from splatseed.sfm.photos import EXCLUDED, find_photos, match_poses
 from splatseed.sfm.refinement import Refinement, refine, unrefined_finding
-from splatseed.sfm.work_folder import WorkFolder, resumable_work, work_key
+from splatseed.sfm.work_folder import resumable_work, work_key
 from splatseed.text import counted
 
 OnPhotos: TypeAlias = Callable[[Sequence[str], Mapping[str, Sequence[str]], str], None]
 _DEFAULT = Settings()
-_CHILD = {"OPENBLAS_NUM_THREADS": "1"}  # our threads and NumPy's own would wait for each other
-_WORK = ".work"  # folder of temporary files in the staging folder
-_REASON = re.compile(r"what\(\):\s*(.*)|^[EF]\d{8}\s.*?\]\s*(.*)", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -95,13 +83,10 @@ class SfmReport:
     seconds: Mapping[str, float]  # wall time by stage, in order
     refinement: Refinement | None = None  # None without ``refine_poses``
     poses: tuple[Image, ...] = ()  # the known poses, refined with ``refine_poses``
+    num_kept: int = 0  # points of the given scene that stay, which have no track
     num_pairs: int = 0  # matched pairs of photographs
     gps: GpsFrame | None = None  # the frame, if it is that of GPS positions
     findings: tuple[Finding, ...] = ()  # a lens held, poses that may be wrong or were not refined
-
-
-Job: TypeAlias = Callable[..., Any]
-"""A job of the child process: (run, staging folder, *arguments) to its result."""
 
 
 def reconstruct(
@@ -125,6 +110,7 @@ def reconstruct(
     on_progress: Progress = silent,
     on_photos: OnPhotos | None = None,
     note: Note = silent_note,
+    color: Color = unchanged,
 ) -> SfmReport:
     """Reconstruct a scene: features, matching, mapping or triangulation, undistortion.
 
@@ -149,10 +135,11 @@ def reconstruct(
         panoramas: Which photographs are equirectangular panoramas, if poses are not known: those
             recognised, ``all`` or ``none``. Each is cut into six photographs, which get one pose.
         mask_below: Angle of straight down, in degrees, within which panoramas are masked.
-        poses_from: A scene with poses and intrinsics; its points are ignored.
+        poses_from: A scene with poses and intrinsics; its points are ignored, or those with tracks.
         refine_poses: Refine poses that are off by a few degrees or per cent of the cameras' extent
             (phones, SLAM). They are unchanged if refinement would lower the mean reprojection
-            error by less than 0.1 px.
+            error by less than 0.1 px. The points of ``poses_from`` without tracks (LiDAR, a mesh)
+            stay beside the triangulated ones, as by ``refined``.
         test_names: Posed photographs, by name, whose poses are refined with the others but which
             neither contribute points nor appear in the scene, such as test views.
         exclude: Photographs to leave out: names or patterns, as for ``io.exclusion.exclude``.
@@ -166,6 +153,7 @@ def reconstruct(
         on_photos: Called before work starts with the photographs' names, the names of skipped
             images by reason, and a description of the cameras (empty if poses are known).
         note: Called with findings on resumed work.
+        color: Gives colours to points that stay where they lack them.
 
     Raises:
         InputError: Photographs missing, unreadable or of another size than their known camera;
@@ -195,7 +183,7 @@ def reconstruct(
             note(finding)
         if whole:
             images, faces, masks = cut_photographs(
-                *(images, whole, others, staging / _WORK / "cut"),
+                *(images, whole, others, staging / WORK / "cut"),
                 masks=masks,
                 mask_below=mask_below,
                 white=find_white([images / name for name in whole])[0],
@@ -206,7 +194,7 @@ def reconstruct(
         if on_photos is not None:
             on_photos(list(photos), left_out, described)
         if refine_poses or poses is None:
-            settings = _for_poses(settings, photos)
+            settings = settings.for_poses(photos)
         lenses = _lenses(cameras, camera_model or default_model(len(others)), poses)
         lenses += [([*rig.camera_ids], rig.lens) for rig in rigs]
         white, _ = find_white([images / name for name in photos])
@@ -221,7 +209,11 @@ def reconstruct(
         work = resumable_work(Path(output), key, note, resume=resume)
         with work if keep or resume else nullcontext() as kept:
             how = (images, staging, settings, on_progress, kept, _reconstruct)
-            report: SfmReport = _call(*how, list(photos), cameras, rigs, *options)
+            report: SfmReport = call(*how, list(photos), cameras, rigs, *options)
+        if refine_poses and poses_from is not None and poses is not None:
+            source = replace(poses_from.source, image_dir=images)
+            given = poses_from.replace(images=poses, source=source, masks=masks, depths=None)
+            report = _with_own_points(report, given, on_progress, color)
         posed = photos.keys() - {*report.unregistered}
         names = {name: faces.get(name, [name]) for name in (*others, *whole)}
         split = split_of_faces({n: [f for f in each if f in posed] for n, each in names.items()})
@@ -304,6 +296,16 @@ def _reconstruct(
     )
 
 
+def _with_own_points(
+    report: SfmReport, given: Scene, progress: Progress, color: Color
+) -> SfmReport:
+    """Add the points that stay of a given scene to the model that was written."""
+    model_dir = report.path / "sparse" / "0"
+    kept, fits = add_own_points(model_dir, given, report.poses, progress, color)
+    findings, number = (*report.findings, *fits), report.num_points + kept
+    return replace(report, num_points=number, num_kept=kept, findings=findings)
+
+
 def _export(
     run: ColmapRun, model_dir: Path, staging: Path, masks: Masks | None, *, distinct: bool = True
 ) -> None:
@@ -351,15 +353,13 @@ def undistort(
     whole = {im.name: im.intrinsics for im in scene.images if im.intrinsics.is_panorama}
     check_mask_below(mask_below, whole)
     with _staged(given, Path(output), "undistort", overwrite=overwrite) as staging:
-        scene = cut_scene(scene, staging / _WORK / "cut", mask_below, on_progress)
+        scene = cut_scene(scene, staging / WORK / "cut", mask_below, on_progress)
         images = photograph_folder(scene).absolute()
-        work = staging / _WORK / "distorted"
+        work = staging / WORK / "distorted"
         distorted = write_scene(scene, work, format="colmap", require_points=False).path
         names, how = sorted(image.name for image in scene.images), (images, staging, _DEFAULT)
         model_dir = distorted / "sparse" / "0"
-        report: SfmReport = _call(
-            *how, on_progress, None, _undistort, model_dir, names, scene.masks
-        )
+        report: SfmReport = call(*how, on_progress, None, _undistort, model_dir, names, scene.masks)
         carry_seeds(scene, distorted, staging)
         write_split(scene, staging)
         write_offset(staging, scene.offset)
@@ -374,187 +374,13 @@ def _undistort(
     return _report(run, staging, names)
 
 
-class RefinedScene(NamedTuple):
-    """A scene at refined poses."""
-
-    scene: Scene
-    num_kept: int  # points of its own that stay, the first; the others were triangulated
-    findings: tuple[Finding, ...]
-
-
-def _unchanged(scene: Scene) -> Scene:
-    return scene
-
-
-def refined(
-    scene: Scene,
-    seed: int,
-    progress: Progress = silent,
-    *,
-    test_every: int = 0,
-    unfit_points: UnfitPoints = "drop",
-    color: Callable[[Scene], Scene] = _unchanged,
-) -> RefinedScene:
-    """Return the scene at refined poses, and what was done.
-
-    Where refinement gains nothing, the scene keeps its poses, and its points if it has any. Else
-    points are triangulated from its photographs' features. They replace those with tracks, which
-    were triangulated at the given poses; others (LiDAR, a mesh) come first and stay, as refined
-    poses are in the given frame, if photographs do not contradict them there. Photographs, lenses
-    and depth maps stay. The test views, every ``test_every``-th (0: none) or those of the scene's
-    list, are refined with the others, but contribute no triangulated point.
-
-    Args:
-        scene: The scene.
-        seed: The seed of RANSAC and bundle adjustment.
-        progress: Called with the stage and the fraction done.
-        test_every: How often a photograph is a test view.
-        unfit_points: What to do with its own points if photographs contradict them.
-        color: Gives colours to its own points at refined poses where they lack them.
-
-    Raises:
-        SceneNotFoundError: It has no photographs.
-        ReconstructionError: The poses drifted, or no point could be triangulated.
-        MissingDependencyError: pycolmap is absent.
-    """
-    require("pycolmap")
-    folder, own = photograph_folder(scene).absolute(), int(scene.points.distinct.sum())
-    test = scene.split(test_every)[1]
-    photos, _ = find_photos(folder)
-    poses = match_poses(photos, scene, folder)
-    with TemporaryDirectory(prefix="splatseed-refine-") as name:
-        (Path(name) / _WORK).mkdir()
-        names = {image.name for image in test}
-        settings = _for_poses(Settings(seed=seed), photos)
-        child = (folder, Path(name), settings, progress, None, _refine)
-        found: _Refined = _call(*child, poses, names, scene.masks, own > 0)
-    change, kept, count = found.refinement, scene.points, f"{len(found.points):,}"
-    fits: tuple[Finding, ...] = ()
-    if change.kept:
-        what = "Poses and points stay" if own else f"{count} points were triangulated; poses stay"
-        how = f"{what} as given: refined poses gain less than 0.1 px of reprojection error."
-    else:
-        kept, fits = points_kept(
-            scene, found.poses, unfit_points, progress, test_every=test_every, color=color
-        )
-        how = (
-            f"{_what_stays(own, len(kept), count)} at refined poses, which lower the mean "
-            f"reprojection error from {change.error_before:.2f} to {change.error_after:.2f} "
-            f"px: cameras turned by {change.median_turn:.2f} degrees and moved by "
-            f"{change.median_shift:.3g} units, both the median."
-        )
-        others = {image.name for image in scene.images} - {image.name for image in poses}
-        unread = [name for name in sorted(others) if (folder / name).is_file()]
-        if unrefined := unrefined_finding(len(scene.images), change.excluded, unread):
-            how = f"{how} {unrefined}"
-    points = PointCloud.concatenate(kept, found.points)  # if poses stay, the scene is returned
-    scene = with_refined(scene, scene.replace(images=found.poses, points=points))
-    return RefinedScene(scene, len(kept), (Finding("refined-poses", how, "info"), *fits))
-
-
-def _what_stays(own: int, kept: int, triangulated: str) -> str:
-    """Begin a sentence about the scene's points and those triangulated."""
-    if not own:
-        return f"{triangulated} points are triangulated"
-    if kept == own:
-        return f"The scene's {own:,} points stay, beside {triangulated} triangulated"
-    which = f"{own - kept:,} of the scene's {own:,}" if kept else f"The scene's {own:,}"
-    return f"{which} points are replaced by {triangulated} triangulated"
-
-
-_LARGE = 1600  # px; longer sides of photographs whose features suffice without doubling
-
-
-def _for_poses(settings: Settings, photos: Photos) -> Settings:
-    """Return settings for estimating or refining poses; sizes that the caller chose stay.
-
-    Large photographs are not doubled but used at up to 2,000 px: the pose error of 40 of a phone's
-    of 1,920 px, refined, and of 97 of 1,800 px is the same, in a third of the time, by 0.44 of the
-    features or points.
-    """
-    chosen = (settings.max_image_size, settings.doubled)
-    longer_sides = [max(photo.size) for photo in photos.values()]
-    if chosen == (_DEFAULT.max_image_size, _DEFAULT.doubled) and np.median(longer_sides) >= _LARGE:
-        return replace(settings, max_image_size=2000, doubled=False)
-    return settings
-
-
-class _Refined(NamedTuple):
-    poses: tuple[Image, ...]
-    points: PointCloud
-    refinement: Refinement
-
-
-def _refine(
-    run: ColmapRun,
-    _: Path,
-    poses: Sequence[Image],
-    test_names: Collection[str],
-    masks: Masks | None,
-    has_points: bool,
-) -> _Refined:
-    match_photographs(run, colmap.posed_model(run.pycolmap, poses), masks, poses)
-    poses, refinement = refine(run, poses)
-    if refinement.kept and has_points:  # which stay
-        return _Refined(tuple(poses), PointCloud.empty(), refinement)
-    model = run.pycolmap.Reconstruction(colmap.triangulate_points(run, poses, test_names))
-    drop_repeats(model)
-    points = [point for _, point in sorted(model.points3D.items())]
-    xyz = np.array([point.xyz for point in points], np.float32)
-    cloud = PointCloud(xyz, np.array([point.color for point in points], np.uint8))
-    return _Refined(tuple(poses), cloud.select(cloud.distinct), refinement)
-
-
 @contextmanager
 def _staged(images: Path, output: Path, kind: str, *, overwrite: bool) -> Iterator[Path]:
     """Yield the staging folder of the scene, with ``.work`` for temporary files on its disk."""
     with output_folder(output, kind=kind, overwrite=overwrite, protect=(images,)) as staging:
-        (staging / _WORK).mkdir()
+        (staging / WORK).mkdir()
         yield staging.absolute()
-        rmtree(staging / _WORK)
-
-
-def _call(
-    images: Path,
-    staging: Path,
-    settings: Settings,
-    progress: Progress,
-    kept: WorkFolder | None,
-    job: Job,
-    *arguments: Any,
-) -> Any:
-    """Run a job in a child process; return its result."""
-    log = staging / _WORK / "log.txt"
-    call = (_work, images, staging, settings, kept, job, arguments)
-    limited = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS") if settings.threads > 0 else ()
-    environment = {**_CHILD, **dict.fromkeys(limited, str(settings.threads))}
-    with closing(Child(*call, reports=True, environment=environment, log=log.open("w+b"))) as child:
-        try:
-            return child.result(progress)
-        except errors.TaskLostError as error:
-            reasons, found = _REASON.findall(log.read_text("utf-8", "replace")), error.found
-            if reasons:
-                found = f"{found.partition(':')[0]}: {''.join(reasons[-1])}"
-            fix = "Check disk space and memory."
-            if kept is not None:
-                fix = f"{fix[:-1]}, and run it again: finished work is in {kept.folder}."
-            raise errors.ReconstructionError("pycolmap to finish", found=found, fix=fix) from error
-
-
-def _work(
-    images: Path,
-    staging: Path,
-    settings: Settings,
-    kept: WorkFolder | None,
-    job: Job,
-    arguments: Sequence[Any],
-    progress: Progress,
-) -> Any:
-    pycolmap = colmap.require_pycolmap(settings.device)
-    pycolmap.logging.logtostderr = True  # not to files in the temporary folder
-    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
-    run = ColmapRun(pycolmap, settings, images, staging / _WORK, progress, kept)
-    return job(run, staging, *arguments)
+        rmtree(staging / WORK)
 
 
 def _report(run: ColmapRun, staging: Path, names: Sequence[str]) -> SfmReport:

@@ -25,7 +25,8 @@ from splatseed.camera import quat_from_rotation
 from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.findings import Finding
 from splatseed.io.files import read_json
-from splatseed.io.nerfstudio import NERFSTUDIO, pair_centers, similarity_in
+from splatseed.io.matrices import NERFSTUDIO, similarity_in
+from splatseed.io.nerfstudio import pair_centers
 from splatseed.io.origin import find_shift, format_offset, offset_beside
 from splatseed.photos.view import View
 from splatseed.progress import Note, silent_note

@@ -21,7 +21,7 @@ from splatseed.io.depth_maps import write_description
 from splatseed.io.files import StrPath
 from splatseed.io.staging import output_folder
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import Image, Observations, Scene, Tracks
+from splatseed.scene import Image, Scene
 from splatseed.synthetic.room import (
     TEXTURELESS,
     Room,
@@ -32,6 +32,7 @@ from splatseed.synthetic.room import (
 )
 from splatseed.synthetic.surfaces import Union
 from splatseed.synthetic.tracks import TrackedPoints, track_points
+from splatseed.tracks import Observations, Tracks
 
 DEPTH_SCALE = 5000
 """Depth PNGs hold metres times this, rounded to 16 bits (as TUM's); 0 = no depth."""

@@ -23,6 +23,7 @@ from splatseed.io import load_scene
 from splatseed.io.exclusion import exclude
 from splatseed.io.files import StrPath, read_text
 from splatseed.io.masks import with_masks
+from splatseed.io.regions import parse_region
 from splatseed.io.staging import reserved
 from splatseed.photos.loading import user_cache_dir
 from splatseed.photos.sizes import factor_for_side
@@ -190,8 +191,9 @@ def prepare_training(
         settings = _with_default_split(settings, scene, note)
     settings = _sized(settings, scene, request.long_side, resumed, note)
     settings = _within_budget(settings, request.budget, scene, note)
-    if settings.seeding == "auto" and (why := no_seeding_reason(scene, settings)):
-        note(Finding("unused-setting", f"`seeding='auto'` has no effect: {why}."))
+    given = "region" if settings.region else "seeding='auto'" * (settings.seeding == "auto")
+    if given and (why := no_seeding_reason(scene, settings)):
+        note(Finding("unused-setting", f"`{given}` has no effect: {why}."))
     named = {*request.named}
     named |= {"cap_max"} if request.budget is not None else set()
     named |= {"data_factor"} if request.long_side is not None else set()
@@ -249,10 +251,18 @@ def _named_settings(request: TrainRequest, *, resumes: bool) -> TrainSettings:
     if resumes:
         given = {name: getattr(settings, name) for name in request.named}
         settings = dataclasses.replace(TrainSettings(), **given)
+    if settings.region is not None:
+        parse_region(settings.region)  # before any work
+        if "seeding" in request.named and settings.seeding == "scene":
+            found, fix = "`seeding='scene'`", "Leave one out: it adds no points."
+            raise ParameterError("`region` with points to add there", found=found, fix=fix)
+        if Path(settings.region).is_file():  # to resume from another folder
+            settings = dataclasses.replace(settings, region=str(Path(settings.region).resolve()))
     if settings.start is None:
         return settings
-    if request.refine_poses or "seeding" in request.named:
-        other = "refine_poses" if request.refine_poses else "seeding"
+    if request.refine_poses or {"seeding", "region"} & request.named:
+        other = "seeding" if "seeding" in request.named else "region"
+        other = "refine_poses" if request.refine_poses else other
         raise ParameterError(f"`start` or `{other}`", found="both", fix="Leave one out.")
     return dataclasses.replace(settings, start=str(model_file(Path(settings.start)).resolve()))
 

@@ -23,6 +23,7 @@ from torch import Tensor
 from splatseed.depth.stereo.maps import StereoSettings
 from splatseed.errors import MissingDependencyError, SceneFormatError
 from splatseed.io import load_scene
+from splatseed.io.exclusion import exclude
 from splatseed.io.masks import with_masks
 from splatseed.io.photograph_checks import with_photographs
 from splatseed.photos.camera_check import reference_points
@@ -64,6 +65,7 @@ def floaters_of_model(
     data_factor: float | None = None,
     test_every: int = 8,
     masks: str | None = None,
+    excluded: Sequence[str] = (),
     progress: Progress = silent,
 ) -> Bool[np.ndarray, " N"]:
     """Find the floaters of a file, in its order.
@@ -76,6 +78,7 @@ def floaters_of_model(
             which stereo compares them.
         test_every: Every n-th image, sorted by name, is a test view.
         masks: Which masks, as for ``io.masks.with_masks``.
+        excluded: Photographs to leave out, as for ``exclude``, beside those that the run left out.
         progress: Called with the name of a stage and its fraction done.
 
     Raises:
@@ -85,7 +88,7 @@ def floaters_of_model(
     """
     settings = TrainSettings(strategy="grow", data_factor=data_factor or 1, test_every=test_every)
     scene = without_dropped(load_scene(scene_path, require_points=False), config_of(path))
-    scene = with_photographs(with_masks(scene, masks))
+    scene = with_photographs(with_masks(exclude(scene, excluded), masks))
     images = photographed(scene, test_every, without="leave `clean` out")
     gaussians = read_start(path, scene, lambda _: None)
     if data_factor is None:

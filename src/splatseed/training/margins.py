@@ -9,6 +9,7 @@ Gaussians that reach across its edge; the same model gives the same bytes.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,6 +20,7 @@ from jaxtyping import Bool, Float, Float32, Float64
 
 from splatseed.camera import Camera
 from splatseed.photos.view import NO_PIXELS, View
+from splatseed.progress import Progress, silent
 from splatseed.projection import scaled
 from splatseed.splat.gaussians import SH_C0, Gaussians
 from splatseed.splat.rendering import ModelRenderer
@@ -68,6 +70,7 @@ def with_margins(
     views: Sequence[View],
     cap: int | None,
     device: torch.device | None = None,
+    progress: Progress = silent,
 ) -> Gaussians:
     """Add the margins of the training views to a model; both are in the scene's frame.
 
@@ -78,16 +81,22 @@ def with_margins(
     renderer = ModelRenderer(model, frame, device)
     # Many views are rendered smaller, so that all continuations fit into memory.
     side, step = SIDE / max(1.0, math.sqrt(len(views) / FULL_SIZE)), STEP
-    small = [_reduced(view, side) for view in views]
-    depths = [renderer.depth(view) for view in small]
-    values = [_continued(renderer.color(v), d) for v, d in zip(small, depths, strict=True)]
+    small, depths, values = [_reduced(view, side) for view in views], [], []
+    for i, view in enumerate(small):
+        depths.append(renderer.depth(view))
+        values.append(_continued(renderer.color(view), depths[i]))
+        progress("margins", 0.5 * (i + 1) / len(small))
     near = [float(np.quantile(d[d > 0], NEAR)) if (d > 0).any() else 0.0 for d in depths]
-    while True:
-        parts = [_margin(i, small, near, values[i], step) for i in range(len(small))]
+    for passes in itertools.count(1):
+        parts = []
+        for i in range(len(small)):
+            parts.append(_margin(i, small, near, values[i], step))
+            progress("margins", 1 - 0.5 ** (passes + (i + 1) / len(small)))  # of an unknown number
         xyz, colors, sizes = (np.concatenate(each) for each in zip(*parts, strict=True))
         if len(xyz) <= limit:
             break
         step += max(1, step // 8)
+    progress("margins", 1.0)
     if cap is not None and len(model) + len(xyz) > cap:
         order = np.argsort(-model.opacities, kind="stable")[: cap - len(xyz)]
         model = model.select(np.sort(order))

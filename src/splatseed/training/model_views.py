@@ -16,6 +16,7 @@ import numpy as np
 
 from splatseed.errors import SceneNotFoundError
 from splatseed.io import load_scene
+from splatseed.io.exclusion import exclude
 from splatseed.io.masks import with_masks
 from splatseed.io.origin import find_shift, offset_beside
 from splatseed.io.photograph_checks import with_photographs
@@ -31,7 +32,7 @@ from splatseed.splat.background import background_of
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.model_frame import scene_from_model, translate_gaussians, view_in_model_frame
 from splatseed.splat.training_frame import TrainingFrame, frame_of_model
-from splatseed.training.config import has_run_poses
+from splatseed.training.config import has_run_poses, without_dropped
 from splatseed.training.settings import TrainSettings
 
 NO_CONFIG: Mapping[str, Any] = MappingProxyType({})
@@ -63,6 +64,7 @@ def find_model_views(
     scene_path: Path,
     config: Mapping[str, Any] = NO_CONFIG,
     progress: Progress = silent,
+    excluded: Sequence[str] = (),
 ) -> ModelViews:
     """Find the views of the scene of a model.
 
@@ -73,6 +75,7 @@ def find_model_views(
         config: Of its run, as of ``config_of``; gives the size of photographs, the test views and
             the masks.
         progress: Called with the name of a stage and its fraction done.
+        excluded: Photographs to leave out, as for ``exclude``, beside those that the run left out.
 
     Raises:
         SceneNotFoundError: The scene is missing, or has no images.
@@ -80,7 +83,8 @@ def find_model_views(
             another scene.
     """
     masks = config.get("masks")
-    scene = with_masks(load_scene(scene_path, require_points=False), masks)
+    scene = without_dropped(load_scene(scene_path, require_points=False), config)
+    own, scene = has_run_poses(config, scene), with_masks(exclude(scene, excluded), masks)
     scene = scene.replace(background=background_of(path) or BLACK)
     photographed = False
     with suppress(SceneNotFoundError):
@@ -95,7 +99,6 @@ def find_model_views(
     factor = config.get("data_factor")
     if not isinstance(factor, int | float) or factor < 1:
         factor = default_factor(scene.images)
-    own = has_run_poses(config, scene)
     world = _file_from_scene(path, gaussians, scene, own=own)
 
     def views_of(images: Sequence[Image], *, pixels: bool) -> tuple[View, ...]:

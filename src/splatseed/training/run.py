@@ -134,9 +134,10 @@ class TrainingRun:
         if state.step < self.settings.max_steps:  # the last step takes the mean itself
             take_mean(state.params, state.mean)
         with self.translate_errors():
+            model = self._model(progress)
             progress("score", 0.0)
             folder.claim([folder.renders / name for name in self._pictures.values()])
-            write_gaussians(folder.gaussians, self._model())
+            write_gaussians(folder.gaussians, model)
             # The file that the user gets is scored, read back.
             world = read_gaussians(folder.gaussians)
             render = ModelRenderer(world, self.frame, self.trainer.device).image
@@ -162,13 +163,13 @@ class TrainingRun:
             folder.checkpoint.unlink(missing_ok=True)
         return result
 
-    def _model(self) -> Gaussians:
+    def _model(self, progress: Progress) -> Gaussians:
         """Return the Gaussians in the scene's frame; with margins."""
         model = self.frame.gaussians_to_world(gaussians_of(self.state.params))
         views, cap = self._train_views, self.settings.cap
         if not has_margins(self.settings, views):
             return model
-        return with_margins(model, self.frame, views, cap, self.trainer.device)
+        return with_margins(model, self.frame, views, cap, self.trainer.device, progress)
 
     def _end_curve(self, scores: EvalResult, num_gaussians: int) -> None:
         """Make the curve end with the scores of the model that has margins."""

@@ -56,7 +56,7 @@ def seeded(
     if settings.seeding == "scene" or no_seeding_reason(scene, settings):
         return scene, None
     why = ""
-    if settings.seeding == "advised" and not triangulated:
+    if settings.seeding == "advised" and settings.region is None and not triangulated:
         limit = settings.max_seeds(settings.cap or BUDGET)
         why_not, room = settings.traits.why_no_seeds, len(scene.points) * MIN_ROOM <= limit
         regions = empty_regions(scene, progress) if why_not and room else None
@@ -74,6 +74,7 @@ def seeded(
         scene,
         Auto(test_every=settings.test_every, max_size=size, dense=False),
         budget=None if settings.cap is None else settings.max_seeds(settings.cap),
+        region=settings.region,
         progress=progress,
         note=note,
         on_stereo=stereo.append,

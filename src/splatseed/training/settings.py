@@ -15,6 +15,7 @@ import tyro
 
 from splatseed.checkup.choices import UnfitPoints
 from splatseed.findings import Finding
+from splatseed.io.regions import REGION_FORM
 from splatseed.photos.sizes import TRAINED_SIDE, default_factor
 from splatseed.progress import Note, silent_note
 from splatseed.scene import TEST_EVERY, Image
@@ -98,6 +99,10 @@ class TrainSettings:
     """Start from the scene's points as they are (scene), with those that method auto adds from the
     training photographs (auto), or as splatseed info advises for this strategy and budget
     (advised). Points that splatseed has added already, and 3DGS's conventions, are left alone."""
+    region: Annotated[str | None, tyro.conf.arg(metavar=REGION_FORM)] = None
+    """Add points in this region alone, even where none are advised: a box, a sphere, or a turned
+    box, as of splatseed upsample; the scene's own points stay. Write --region=-1,... if the first
+    number is negative."""
 
     unfit_points: UnfitPoints = "drop"
     """What to do with the scene's points where photographs contradict them: leave them out, move

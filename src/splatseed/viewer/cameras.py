@@ -14,6 +14,7 @@ from splatseed.camera import Camera
 from splatseed.errors import SceneFormatError
 from splatseed.findings import Finding
 from splatseed.io import load_scene
+from splatseed.io.exclusion import EXCLUDED, exclude
 from splatseed.io.files import IMAGE_SUFFIXES, read_json, translate_errors
 from splatseed.io.origin import find_shift
 from splatseed.photos.view import NO_PIXELS, View, camera_views
@@ -26,7 +27,7 @@ from splatseed.viewer.camera_path import MAX_SIDE, CameraPath, is_rotation, pars
 
 SHAPE = (960, 720)
 """Width and height of the frames of a path that has no size."""
-_ABOUT_POSES = ("unusable-images", "bad-frames", "duplicate-frames", "ignored-distortion")
+_ABOUT_POSES = ("unusable-images", "bad-frames", "duplicate-frames", "ignored-distortion", EXCLUDED)
 """Findings of a scene that concern its cameras as they are rendered."""
 
 
@@ -55,18 +56,20 @@ def is_scene(path: Path) -> bool:
     return isinstance(content, dict) and "camera_path" not in content
 
 
-def read_cameras(path: Path, known: Scene | None = None) -> GivenCameras:
+def read_cameras(
+    path: Path, known: Scene | None = None, excluded: Sequence[str] = ()
+) -> GivenCameras:
     """Read the cameras of a scene, of graphdeco's ``cameras.json`` or of a camera path.
 
     Those of a scene are moved to the origin of the ``known`` one, and keep the size of their
-    photograph, or without one that of the file.
+    photograph, or without one that of the file; without those that ``excluded`` names.
 
     Raises:
         SceneNotFoundError: There is nothing.
         SceneFormatError: It is malformed or has no cameras.
     """
     if is_scene(path):
-        return _cameras_of_scene(path, known)
+        return _cameras_of_scene(path, known, excluded)
     content = read_json(path)
     if isinstance(content, list):
         return GivenCameras(tuple(_graphdeco_cameras(path, content)), of_scene=False)
@@ -75,9 +78,10 @@ def read_cameras(path: Path, known: Scene | None = None) -> GivenCameras:
     return GivenCameras(tuple(parsed.views(size)), of_scene=False, path=parsed)
 
 
-def _cameras_of_scene(path: Path, known: Scene | None) -> GivenCameras:
+def _cameras_of_scene(path: Path, known: Scene | None, excluded: Sequence[str]) -> GivenCameras:
     same = known is not None and known.source.named == path.absolute()
     scene = known if known is not None and same else load_scene(path, require_points=False)
+    scene = exclude(scene, excluded)
     if not scene.images:
         raise SceneFormatError(
             f"cameras in {path}",

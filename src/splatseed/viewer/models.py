@@ -17,9 +17,10 @@ from jaxtyping import Float64, UInt8
 from PIL import Image as PillowImage, ImageDraw
 
 from splatseed.camera import Camera
-from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.findings import Finding
 from splatseed.io import load_scene
+from splatseed.io.exclusion import EXCLUDED, exclude
 from splatseed.io.files import StrPath
 from splatseed.photos.camera_check import reference_points
 from splatseed.photos.upright import quarter_turns, turned
@@ -88,13 +89,26 @@ class ViewerItem:
         return tuple(replace(view, camera=turned(view.camera, turn)) for view, turn in pairs)
 
 
-def open_item(path: StrPath, scene_path: Path | None = None) -> ViewerItem:
+def open_item(
+    path: StrPath, scene_path: Path | None = None, excluded: Sequence[str] = ()
+) -> ViewerItem:
     """Read a scene, a run folder, or a file of Gaussians or points.
 
     A model's scene is at ``scene_path``, by default where its run's config has it, if it exists.
+    Photographs that ``excluded`` names, as for ``exclude``, are left out of it.
     """
-    path = Path(path)
+    item = _read_item(Path(path), scene_path)
+    if item.scene is None:
+        if excluded:
+            found = f"{path}, whose scene is not known"
+            raise ParameterError("`exclude` with a scene", found=found, fix="Name its `scene`.")
+        return item
+    scene = exclude(item.scene, excluded)
+    findings = (each for each in scene.findings if each.kind == EXCLUDED)
+    return replace(item, scene=scene, findings=(*item.findings, *findings))
 
+
+def _read_item(path: Path, scene_path: Path | None) -> ViewerItem:
     def scene_at(folder: Path | None) -> Scene | None:
         return None if folder is None else load_scene(folder, require_points=False)
 
@@ -125,8 +139,8 @@ def open_item(path: StrPath, scene_path: Path | None = None) -> ViewerItem:
             found="a run that has not finished",
             fix=f"Continue it: splatseed train SCENE -o {quoted(folder.path)} --resume.",
         )
-    scene = scene_at(scene_path) or scene_of_run(folder)
-    config = folder.read_config()
+    config, scene = folder.read_config(), scene_at(scene_path)
+    scene = scene_of_run(folder) if scene is None else without_dropped(scene, config)
     factor, every = config.get("data_factor") or 1, int(config.get("test_every", TEST_EVERY))
     gaussians, moved = read_gaussians(folder.gaussians, findings.append), None
     if scene is not None:

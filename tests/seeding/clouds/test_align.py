@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatseed.errors import PointCloudError
-from splatseed.io.nerfstudio import read_cloud_transform
+from splatseed.io.matrices import read_cloud_transform
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.seeding.clouds.align import AlignSettings, align_cloud

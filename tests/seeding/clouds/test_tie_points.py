@@ -9,8 +9,9 @@ import pytest
 
 from splatseed.camera import Intrinsics
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import Image, Scene, Tracks
+from splatseed.scene import Image, Scene
 from splatseed.seeding.clouds.tie_points import pixel_noise, select_tie_points, triangulation
+from splatseed.tracks import Tracks
 
 FOCAL, BASE, DEPTH = 500.0, 0.2, 4.0
 CAMERA = Intrinsics(1, "PINHOLE", 800, 600, (FOCAL, FOCAL, 400.0, 300.0))

@@ -22,7 +22,7 @@ from splatseed.io.colmap_model import scene_root
 from splatseed.io.exclusion import exclude
 from splatseed.io.load import with_depths_in, with_own_depths
 from splatseed.io.masks import with_masks
-from splatseed.io.nerfstudio import read_cloud_transform
+from splatseed.io.matrices import read_cloud_transform
 from splatseed.io.origin import (
     RECENTER,
     find_shift,

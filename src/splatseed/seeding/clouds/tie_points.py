@@ -18,8 +18,9 @@ from splatseed.errors import PointCloudError
 from splatseed.pointcloud import ORIGINAL
 from splatseed.projection import in_camera, pixel_jacobians
 from splatseed.sampling import strided
-from splatseed.scene import Image, Scene, Tracks
+from splatseed.scene import Image, Scene
 from splatseed.similarity import Similarity
+from splatseed.tracks import Tracks
 
 Points = Float64[np.ndarray, "N 3"]
 
