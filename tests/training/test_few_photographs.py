@@ -1,4 +1,4 @@
-"""With few photographs each step drops some Gaussians, and all photographs are trained on."""
+"""Few photographs: dropout, fading opacities and random backgrounds; all are trained on."""
 
 from __future__ import annotations
 
@@ -15,7 +15,12 @@ from splatseed.training import trainer
 from splatseed.training.api import prepare_training
 from splatseed.training.folder import config_of
 from splatseed.training.model_views import find_model_views
-from splatseed.training.parameters import DROPPED, as_parameters, with_dropout
+from splatseed.training.parameters import (
+    DROPPED,
+    as_parameters,
+    decay_opacities,
+    with_dropout,
+)
 from splatseed.training.request import TrainRequest
 from splatseed.training.schedule import make_schedule
 from splatseed.training.traits import STRATEGIES
@@ -47,16 +52,31 @@ def test_raised_opacities_stay_below_one():
     assert torch.isfinite(with_dropout(params, 0.01)["opacities"]).all()
 
 
-def test_dropout_rises_and_3dgs_has_none():
+def test_opacities_fade_by_a_factor():
+    params = as_parameters({"opacities": torch.tensor([0.3, 0.999]).logit()})
+    for _ in range(10):
+        decay_opacities(params, 0.9)
+    torch.testing.assert_close(
+        torch.sigmoid(params["opacities"]).detach(), torch.tensor([0.3, 0.999]) * 0.9**10
+    )
+    for _ in range(1000):
+        decay_opacities(params, 0.9)
+    assert (params["opacities"] == DROPPED).all()
+
+
+def test_dropout_rises_and_3dgs_has_none_of_this():
     schedule = make_schedule(STRATEGIES["grow"], 1500, as_3dgs=False)
-    assert [schedule.dropout_at(step) for step in (0, 750, 1500)] == [0, 0.1, 0.2]
-    assert make_schedule(STRATEGIES["default"], 1500, as_3dgs=True).dropout_at(1500) == 0
+    assert [schedule.dropout_at(step) for step in (0, 750, 1500)] == [0, 0.3, 0.6]
+    theirs = make_schedule(STRATEGIES["default"], 1500, as_3dgs=True)
+    assert theirs.dropout_at(1500) == 0
+    assert theirs.opacity_decay == 1
+    assert not theirs.random_background
 
 
 @pytest.mark.parametrize(("few", "differs"), [(7, True), (6, False)])
 def test_only_runs_with_few_photographs_are_changed(begin, monkeypatch, few, differs):
     def trained(name, most):
-        monkeypatch.setattr(trainer, "MAX_DROPOUT_VIEWS", most)
+        monkeypatch.setattr(trainer, "MAX_FEW_VIEWS", most)
         run = begin(name, strategy="none", max_steps=9)
         assert len(run.trainer.train_views) == 7
         run.train()

@@ -192,3 +192,13 @@ def test_a_black_object_does_not_become_transparent(larger_room_path, tmp_path):
     over_white = render_view(run.state.params, view, 0, torch.ones(3))[0].detach().mean(dim=-1)
     assert over_white[view.opacity == 250].mean() < 0.3
     assert over_white[view.opacity == 0].mean() > 0.6
+
+
+def test_dark_pixels_are_not_left_transparent(begin):
+    run = begin(strategy="none", max_steps=80)
+    for view in run.trainer.train_views:
+        view.photograph[:] //= 20
+    run.train()
+    white = torch.ones(3)
+    render, _ = render_view(run.state.params, run.trainer.train_views[0], 0, white)
+    assert render.detach().mean() < 0.2

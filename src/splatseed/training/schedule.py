@@ -50,13 +50,15 @@ MIN_ROUND_STEPS = 20
 split again before they have settled are noise."""
 MEAN_FROM = 0.8
 """Fraction of a run after which the mean of the Gaussians is taken."""
-DROPOUT = 0.2
+MAX_FEW_VIEWS = 16
+"""Maximum number of training photographs that count as few: they are fitted by Gaussians that no
+other view confirms. With more photographs, close to each other, dropout loses."""
+DROPOUT = 0.6
 """Fraction of the Gaussians that the last step of a run with few photographs drops, as in
 DropGaussian (H. Park et al., 2025); linear from 0 at its first."""
-MAX_DROPOUT_VIEWS = 16
-"""Maximum number of training photographs with which Gaussians are dropped. Few photographs are
-fitted by Gaussians that no other view confirms; with more photographs, close to each other, dropout
-loses."""
+OPACITY_DECAY = 0.998
+"""Factor on all opacities after each step of such a run, so that those which no photograph needs
+fade (L. Han et al., Binocular-Guided 3D Gaussian Splatting, 2024)."""
 MAX_SIZE = 0.05
 """Maximum initial size of a Gaussian, in min view depths. Where SfM has few points the gaps between
 them are wide, and a Gaussian that fills a gap hides everything behind it."""
@@ -93,6 +95,10 @@ class Schedule:
     flatness: float = 0.1  # initial thickness of Gaussians with normals, relative to their size
     recycles: bool = True  # strategy grow replaces Gaussians where seeds fill the budget
     dropout: float = 0.0  # fraction of the Gaussians that the last step drops, if views are few
+    opacity_decay: float = 1.0  # factor on all opacities after each step, if views are few
+    random_background: bool = False
+    """Each step has another background: over black, dark pixels are left transparent, and other
+    views show something else through them."""
     mean_from: int | None = None
     """Step from which on the Gaussians are averaged to the run's result; None: the last step's are
     the result."""
@@ -168,6 +174,8 @@ def _own(theirs: Schedule, strategy: StrategyTraits) -> Schedule:
         scale_factor=1.0,
         max_size=MAX_SIZE,
         dropout=DROPOUT,
+        opacity_decay=OPACITY_DECAY,
+        random_background=True,
         # Only once the number of Gaussians no longer changes.
         mean_from=max(stop, round(MEAN_FROM * theirs.max_steps)),
     )

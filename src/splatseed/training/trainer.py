@@ -32,8 +32,14 @@ from splatseed.splat.photographs import (
 from splatseed.splat.rendering import render_view
 from splatseed.splat.ssim import l1_and_ssim, l1_and_ssim_by_convolution
 from splatseed.training.folder import Record
-from splatseed.training.parameters import add_to_mean, optimize, take_mean, with_dropout
-from splatseed.training.schedule import MAX_DROPOUT_VIEWS
+from splatseed.training.parameters import (
+    add_to_mean,
+    decay_opacities,
+    optimize,
+    take_mean,
+    with_dropout,
+)
+from splatseed.training.schedule import MAX_FEW_VIEWS
 from splatseed.training.settings import TrainSettings
 from splatseed.training.state import TrainState
 
@@ -113,13 +119,14 @@ class Trainer:
         index = int(order[position])
         view = self.train_views[index]
         photograph, background = self._photographs.get(view), None
-        if view.opacity is not None and state.exposures is None:
+        varies = view.opacity is not None or (schedule.random_background and view.empty is None)
+        if varies and state.exposures is None:
             # On one background its colour could pass for an object, and the object for nothing.
             background = torch.rand(3).to(self.device, non_blocking=True)
             photograph = over_background(photograph, view, background)
+        few = len(self.train_views) <= MAX_FEW_VIEWS
         # The recorded loss and PSNR are with dropout.
-        sparse = len(self.train_views) <= MAX_DROPOUT_VIEWS
-        shown = with_dropout(params, schedule.dropout_at(step)) if sparse else params
+        shown = with_dropout(params, schedule.dropout_at(step)) if few else params
         degree = schedule.sh_degree(step, self.settings.sh_degree)
         plain, info = render_view(shown, view, degree, background)
         render, mask = plain, mask_tensor(view, self.device)
@@ -135,6 +142,8 @@ class Trainer:
         (loss if penalty is None else loss + penalty).backward()
         self.is_consistent = False
         optimize(params, optimizers, schedule.rates(step))
+        if few and schedule.opacity_decay < 1:
+            decay_opacities(params, schedule.opacity_decay)
         if state.exposures is None:
             strategy.observe(params, view, render, photograph, step)
         else:
