@@ -15,7 +15,7 @@ from splatseed.errors import OutputError, ParameterError, SceneNotFoundError
 from splatseed.training.api import prepare_training
 from splatseed.training.request import TrainRequest
 
-SHORT = {"strategy": "none", "max_steps": 30, "data_factor": 2, "test_every": 3, "seeding": "scene"}
+SHORT = {"strategy": "none", "max_steps": 60, "data_factor": 2, "test_every": 3, "seeding": "scene"}
 
 
 @pytest.fixture(scope="module")

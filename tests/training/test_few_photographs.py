@@ -15,12 +15,7 @@ from splatseed.training import trainer
 from splatseed.training.api import prepare_training
 from splatseed.training.folder import config_of
 from splatseed.training.model_views import find_model_views
-from splatseed.training.parameters import (
-    DROPPED,
-    as_parameters,
-    decay_opacities,
-    with_dropout,
-)
+from splatseed.training.parameters import DROPPED, as_parameters, decay_opacities, with_dropout
 from splatseed.training.request import TrainRequest
 from splatseed.training.schedule import make_schedule
 from splatseed.training.traits import STRATEGIES
