@@ -1,4 +1,4 @@
-"""Few photographs: dropout, fading opacities and random backgrounds; all are trained on."""
+"""Few photographs: dropout and opacity decay; all are trained on."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 from splatseed.scene import Split
 from splatseed.splat.formats import read_gaussians
 from splatseed.splat.render_loss import RenderLoss
-from splatseed.training import trainer
+from splatseed.training import schedule
 from splatseed.training.api import prepare_training
 from splatseed.training.folder import config_of
 from splatseed.training.model_views import find_model_views
@@ -47,31 +47,36 @@ def test_raised_opacities_stay_below_one():
     assert torch.isfinite(with_dropout(params, 0.01)["opacities"]).all()
 
 
-def test_opacities_fade_by_a_factor():
+def test_opacities_decay_by_a_factor():
     params = as_parameters({"opacities": torch.tensor([0.3, 0.999]).logit()})
     for _ in range(10):
-        decay_opacities(params, 0.9)
+        decay_opacities(params, 0.1)
     torch.testing.assert_close(
         torch.sigmoid(params["opacities"]).detach(), torch.tensor([0.3, 0.999]) * 0.9**10
     )
     for _ in range(1000):
-        decay_opacities(params, 0.9)
+        decay_opacities(params, 0.1)
     assert (params["opacities"] == DROPPED).all()
 
 
-def test_dropout_rises_and_3dgs_has_none_of_this():
-    schedule = make_schedule(STRATEGIES["grow"], 1500, as_3dgs=False)
-    assert [schedule.dropout_at(step) for step in (0, 750, 1500)] == [0, 0.3, 0.6]
+def test_dropout_rises_and_is_less_with_more_photographs():
+    ours = make_schedule(STRATEGIES["grow"], 1500, as_3dgs=False)
+    assert [ours.dropout_at(step, 3) for step in (0, 750, 1500)] == [0, 0.3, 0.6]
+    last = [ours.dropout_at(1500, n) for n in (2, 6, 9, 16, 17)]
+    assert last == pytest.approx([0.6, 0.3, 0.2, 0.2, 0])
+    assert [ours.opacity_decay(n) for n in (3, 6, 17)] == pytest.approx([0.002, 0.001, 0])
+
+
+def test_3dgs_regularises_nothing():
     theirs = make_schedule(STRATEGIES["default"], 1500, as_3dgs=True)
-    assert theirs.dropout_at(1500) == 0
-    assert theirs.opacity_decay == 1
+    assert theirs.dropout_at(1500, 3) == theirs.opacity_decay(3) == 0
     assert not theirs.random_background
 
 
 @pytest.mark.parametrize(("few", "differs"), [(7, True), (6, False)])
 def test_only_runs_with_few_photographs_are_changed(begin, monkeypatch, few, differs):
     def trained(name, most):
-        monkeypatch.setattr(trainer, "MAX_FEW_VIEWS", most)
+        monkeypatch.setattr(schedule, "MAX_FEW_VIEWS", most)
         run = begin(name, strategy="none", max_steps=9)
         assert len(run.trainer.train_views) == 7
         run.train()

@@ -32,7 +32,7 @@ ADAM_EPSILON = 1e-15
 """3DGS's: far below any gradient, so that rarely seen Gaussians take full steps too."""
 MIN_VIEW_DEPTH = "min_view_depth"
 DROPPED, MAX_RAISED = -20.0, 0.995
-"""The logit of a dropped Gaussian, which no pixel shows and none fades below, and the highest
+"""The logit of a dropped Gaussian, which no pixel shows and none decays below, and the highest
 opacity of another."""
 MAX_LOGIT = 15.0
 """Largest logit of an opacity that is split: from 17 on its sigmoid is 1 in float32, and the
@@ -134,11 +134,12 @@ def with_dropout(params: Parameters, fraction: float) -> Parameters | Mapping[st
 
 
 @torch.no_grad()
-def decay_opacities(params: Parameters, factor: float) -> None:
-    """Multiply all opacities by a factor below 1."""
-    # o' = f o with o = 1 / (1 + exp(-x)), so exp(-x') = (1 + exp(-x)) / f - 1.
-    logits = params["opacities"].neg_().exp_().add_(1.0).div_(factor).sub_(1.0).log_().neg_()
-    logits.clamp_(min=DROPPED)
+def decay_opacities(params: Parameters, fraction: float) -> None:
+    """Take a ``fraction`` from all opacities."""
+    if fraction > 0:
+        # o' = f o with o = 1 / (1 + exp(-x)), so exp(-x') = (1 + exp(-x)) / f - 1.
+        logits = params["opacities"].neg_().exp_().add_(1.0).div_(1.0 - fraction).sub_(1.0)
+        logits.log_().neg_().clamp_(min=DROPPED)
 
 
 @torch.no_grad()

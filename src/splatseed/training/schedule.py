@@ -53,12 +53,14 @@ MEAN_FROM = 0.8
 MAX_FEW_VIEWS = 16
 """Maximum number of training photographs that count as few: they are fitted by Gaussians that no
 other view confirms. With more photographs, close to each other, dropout loses."""
-DROPOUT = 0.6
+DROPOUT, DROPOUT_RANGE = 1.8, (0.2, 0.6)
 """Fraction of the Gaussians that the last step of a run with few photographs drops, as in
-DropGaussian (H. Park et al., 2025); linear from 0 at its first."""
-OPACITY_DECAY = 0.998
-"""Factor on all opacities after each step of such a run, so that those which no photograph needs
-fade (L. Han et al., Binocular-Guided 3D Gaussian Splatting, 2024)."""
+DropGaussian (H. Park et al., 2025), times their number, and its range; linear from 0 at the
+first step."""
+OPACITY_DECAY = 0.006
+"""Fraction that all opacities lose in each step of such a run, times the number of photographs, so
+that Gaussians that few pixels need vanish (L. Han et al., Binocular-Guided 3D Gaussian Splatting
+with View Consistency for Sparse View Synthesis, 2024)."""
 MAX_SIZE = 0.05
 """Maximum initial size of a Gaussian, in min view depths. Where SfM has few points the gaps between
 them are wide, and a Gaussian that fills a gap hides everything behind it."""
@@ -94,8 +96,7 @@ class Schedule:
     max_size: float = math.inf  # upper bound of the initial size, in min view depths
     flatness: float = 0.1  # initial thickness of Gaussians with normals, relative to their size
     recycles: bool = True  # strategy grow replaces Gaussians where seeds fill the budget
-    dropout: float = 0.0  # fraction of the Gaussians that the last step drops, if views are few
-    opacity_decay: float = 1.0  # factor on all opacities after each step, if views are few
+    regularizes_few: bool = False  # dropout and opacity decay, if views are few
     random_background: bool = False
     """Each step has another background: over black, dark pixels are left transparent, and other
     views show something else through them."""
@@ -107,9 +108,17 @@ class Schedule:
         """Return the degree of the spherical harmonics at a step."""
         return min(step // self.sh_every, highest) if self.sh_every else highest
 
-    def dropout_at(self, step: int) -> float:
-        """Return the fraction of the Gaussians that a step drops."""
-        return self.dropout * step / self.max_steps
+    def dropout_at(self, step: int, num_views: int) -> float:
+        """Return the fraction of the Gaussians that a step of a run on these many views drops."""
+        if not self.regularizes_few or num_views > MAX_FEW_VIEWS:
+            return 0.0
+        least, most = DROPOUT_RANGE
+        return max(least, min(DROPOUT / num_views, most)) * step / self.max_steps
+
+    def opacity_decay(self, num_views: int) -> float:
+        """Return the fraction that opacities lose in each step of a run on these many views."""
+        applies = self.regularizes_few and num_views <= MAX_FEW_VIEWS
+        return OPACITY_DECAY / num_views if applies else 0.0
 
     def rates(self, step: int) -> dict[str, float]:
         """Return the learning rate of each parameter; of positions in size units."""
@@ -173,8 +182,7 @@ def _own(theirs: Schedule, strategy: StrategyTraits) -> Schedule:
         growth=MCMC_GROWTH ** (every / shrunk),
         scale_factor=1.0,
         max_size=MAX_SIZE,
-        dropout=DROPOUT,
-        opacity_decay=OPACITY_DECAY,
+        regularizes_few=True,
         random_background=True,
         # Only once the number of Gaussians no longer changes.
         mean_from=max(stop, round(MEAN_FROM * theirs.max_steps)),

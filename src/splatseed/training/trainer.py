@@ -39,7 +39,6 @@ from splatseed.training.parameters import (
     take_mean,
     with_dropout,
 )
-from splatseed.training.schedule import MAX_FEW_VIEWS
 from splatseed.training.settings import TrainSettings
 from splatseed.training.state import TrainState
 
@@ -124,9 +123,8 @@ class Trainer:
             # On one background its colour could pass for an object, and the object for nothing.
             background = torch.rand(3).to(self.device, non_blocking=True)
             photograph = over_background(photograph, view, background)
-        few = len(self.train_views) <= MAX_FEW_VIEWS
         # The recorded loss and PSNR are with dropout.
-        shown = with_dropout(params, schedule.dropout_at(step)) if few else params
+        shown = with_dropout(params, schedule.dropout_at(step, len(self.train_views)))
         degree = schedule.sh_degree(step, self.settings.sh_degree)
         plain, info = render_view(shown, view, degree, background)
         render, mask = plain, mask_tensor(view, self.device)
@@ -142,8 +140,7 @@ class Trainer:
         (loss if penalty is None else loss + penalty).backward()
         self.is_consistent = False
         optimize(params, optimizers, schedule.rates(step))
-        if few and schedule.opacity_decay < 1:
-            decay_opacities(params, schedule.opacity_decay)
+        decay_opacities(params, schedule.opacity_decay(len(self.train_views)))
         if state.exposures is None:
             strategy.observe(params, view, render, photograph, step)
         else:
