@@ -121,7 +121,7 @@ class Trainer:
         varies = view.opacity is not None or (schedule.random_background and view.empty is None)
         if varies and state.exposures is None:
             # On one background its colour could pass for an object, and the object for nothing.
-            background = torch.rand(3).to(self.device, non_blocking=True)
+            background = torch.rand(3, device=self.device)
             photograph = over_background(photograph, view, background)
         # The recorded loss and PSNR are with dropout.
         shown = with_dropout(params, schedule.dropout_at(step, len(self.train_views)))
