@@ -118,8 +118,8 @@ class Trainer:
         index = int(order[position])
         view = self.train_views[index]
         photograph, background = self._photographs.get(view), None
-        varies = view.opacity is not None or (schedule.random_background and view.empty is None)
-        if varies and state.exposures is None:
+        cut_out = view.opacity is not None and state.exposures is None
+        if cut_out or (schedule.random_background and view.empty is None):
             # On one background its colour could pass for an object, and the object for nothing.
             background = torch.rand(3, device=self.device)
             photograph = over_background(photograph, view, background)
