@@ -191,8 +191,9 @@ def prepare_training(
         settings = _with_default_split(settings, scene, note)
     settings = _sized(settings, scene, request.long_side, resumed, note)
     settings = _within_budget(settings, request.budget, scene, note)
-    given = "region" if settings.region else "seeding='auto'" * (settings.seeding == "auto")
-    if given and (why := no_seeding_reason(scene, settings)):
+    adds_points = settings.region is not None or settings.seeding == "auto"
+    if adds_points and (why := no_seeding_reason(scene, settings)):
+        given = "seeding='auto'" if settings.region is None else "region"
         note(Finding("unused-setting", f"`{given}` has no effect: {why}."))
     named = {*request.named}
     named |= {"cap_max"} if request.budget is not None else set()
@@ -260,10 +261,10 @@ def _named_settings(request: TrainRequest, *, resumes: bool) -> TrainSettings:
             settings = dataclasses.replace(settings, region=str(Path(settings.region).resolve()))
     if settings.start is None:
         return settings
-    if request.refine_poses or {"seeding", "region"} & request.named:
-        other = "seeding" if "seeding" in request.named else "region"
-        other = "refine_poses" if request.refine_poses else other
-        raise ParameterError(f"`start` or `{other}`", found="both", fix="Leave one out.")
+    others = ["refine_poses"] * request.refine_poses
+    others += [name for name in ("seeding", "region") if name in request.named]
+    if others:
+        raise ParameterError(f"`start` or `{others[0]}`", found="both", fix="Leave one out.")
     return dataclasses.replace(settings, start=str(model_file(Path(settings.start)).resolve()))
 
 

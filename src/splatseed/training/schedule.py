@@ -54,13 +54,13 @@ MAX_FEW_VIEWS = 16
 """Maximum number of training photographs that count as few: they are fitted by Gaussians that no
 other view confirms. With more photographs, close to each other, dropout loses."""
 DROPOUT, DROPOUT_RANGE = 1.8, (0.2, 0.6)
-"""Fraction of the Gaussians that the last step of a run with few photographs drops, as in
-DropGaussian (H. Park et al., 2025), times their number, and its range; linear from 0 at the
-first step."""
+"""With n <= ``MAX_FEW_VIEWS`` training photographs the last step drops ``DROPOUT`` / n of the
+Gaussians, within the range; earlier steps drop fewer, linear from 0 at the first. Source:
+DropGaussian (H. Park et al., 2025)."""
 OPACITY_DECAY = 0.006
-"""Fraction that all opacities lose in each step of such a run, times the number of photographs, so
-that Gaussians that few pixels need vanish (L. Han et al., Binocular-Guided 3D Gaussian Splatting
-with View Consistency for Sparse View Synthesis, 2024)."""
+"""With these each step lowers all opacities by the fraction ``OPACITY_DECAY`` / n, so that
+Gaussians that few pixels need vanish. Source: L. Han et al., Binocular-Guided 3D Gaussian Splatting
+with View Consistency for Sparse View Synthesis (2024)."""
 MAX_SIZE = 0.05
 """Maximum initial size of a Gaussian, in min view depths. Where SfM has few points the gaps between
 them are wide, and a Gaussian that fills a gap hides everything behind it."""
