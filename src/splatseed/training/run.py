@@ -29,8 +29,9 @@ from splatseed.splat.rendering import ModelRenderer
 from splatseed.splat.training_frame import TrainingFrame
 from splatseed.training.device import device_name
 from splatseed.training.folder import Record, RunFolder, write_curve_csv, write_curve_png
+from splatseed.training.hidden import recolored
 from splatseed.training.margins import has_margins, with_margins
-from splatseed.training.parameters import gaussians_of, take_mean
+from splatseed.training.parameters import take_mean
 from splatseed.training.settings import TrainSettings
 from splatseed.training.state import TrainState, save_checkpoint
 from splatseed.training.trainer import Trainer
@@ -164,18 +165,19 @@ class TrainingRun:
         return result
 
     def _model(self, progress: Progress) -> Gaussians:
-        """Return the Gaussians in the scene's frame; with margins."""
-        model = self.frame.gaussians_to_world(gaussians_of(self.state.params))
-        views, cap = self._train_views, self.settings.cap
+        """Return the Gaussians in the scene's frame, with what photographs do not show."""
+        state, views, cap = self.state, self._train_views, self.settings.cap
+        dropout = self.settings.schedule.dropout_at(state.step, len(views))
+        model = recolored(state.params, self.trainer.train_views, dropout, progress)
+        model = self.frame.gaussians_to_world(model)
         if not has_margins(self.settings, views):
             return model
         return with_margins(model, self.frame, views, cap, self.trainer.device, progress)
 
     def _end_curve(self, scores: EvalResult, num_gaussians: int) -> None:
-        """Make the curve end with the scores of the model that has margins."""
+        """Make the curve end with the scores of the model that was written."""
         records = self.state.records
-        ends = bool(records) and records[-1].step == self.state.step
-        if ends and has_margins(self.settings, self._train_views):
+        if records and records[-1].step == self.state.step:
             records[-1] = records[-1]._replace(
                 test_psnr=scores.psnr, test_ssim=scores.ssim, num_gaussians=num_gaussians
             )
