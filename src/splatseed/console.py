@@ -381,8 +381,8 @@ def with_options(message: str) -> str:
         'Pass a smaller --ratio, --mls.k 8 or --overwrite.'
         >>> with_options("Pass `depth.align=False` or `masks='my masks'`.")
         "Pass --depth.no-align or --masks 'my masks'."
-        >>> with_options("`placing='none'` only splits.")
-        '`placing = "none"` in a --config file only splits.'
+        >>> with_options("With `placing='none'` it only splits.")
+        'With `placing = "none"` in a --config file it only splits.'
     """
     return ARGUMENT.sub(_option, message)
 
