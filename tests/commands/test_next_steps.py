@@ -93,6 +93,20 @@ def test_minutes_are_those_of_seeds_and_refinement_too(room, monkeypatch):
     assert label("auto", refine=True) == f"train, about {round(12 + 2.0 * count)} s"
 
 
+@pytest.mark.parametrize(("side", "steps"), [(480, 30000), (40, 30000), (480, 1000)])
+def test_the_short_run_is_shorter_and_enlarges_nothing(side, steps, room, monkeypatch):
+    monkeypatch.setattr(next_steps, "which", lambda _: None)  # as without a GPU
+    monkeypatch.setattr(next_steps, "SMALL_SIDE", side)
+    scene = load_scene(room)
+    assert max(image.lens.width for image in scene.images) in range(41, 480)
+    advice = dataclasses.replace(advice_for(scene, 1000), method=AS_IT_IS)
+    planned = Planned.of(scene, max_steps=steps)
+    commands = advice_commands(Source(room), scene, advice, planned, refine=False)
+    short = [line for _, line in commands if "SMALL" in line]
+    size = "--long-side 40 " if side == 40 else ""
+    assert short == [f"splatseed train {room} {size}--max-steps 1500 -o SMALL"][: steps > 1500]
+
+
 @pytest.mark.parametrize(("trainer", "points"), [("gsplat", True), ("nerfstudio", False)])
 def test_the_advice_is_for_the_trainer_that_is_named(
     points, trainer, room, tmp_path, monkeypatch, splatseed

@@ -168,16 +168,25 @@ def advice_commands(
         made = advice.method == "auto"
         first_seconds = _seconds_before(scene, seeds=made, refine=refine and made)
         label = f"train, about {format_duration(planned.seconds + first_seconds)}"
-        small = Planned.of(scene, None, SMALL_STEPS, long_side=SMALL_SIDE)
-        how = f"{refining}--long-side {SMALL_SIDE} --max-steps {SMALL_STEPS} -o SMALL"
-        command = f"splatseed train {source} {how}"
-        first_seconds = _seconds_before(scene, seeds=made, refine=refine)
-        shorter = [(f"or about {format_duration(small.seconds + first_seconds)}", command)]
+        shorter = _shorter(source, scene, planned, seeds=made, refine=refine)
     commands = [*first, (label, train), *shorter]
     if advice.method == "auto":
         others = _seeding(source, advice, planned, refine=refine)
         return [*commands, ("seeds for another trainer", others)]
     return [*commands, ("another trainer", f"splatseed info {source} --for gsplat")]
+
+
+def _shorter(
+    source: Source, scene: Scene, planned: Planned, *, seeds: bool, refine: bool
+) -> Commands:
+    """Return the command for a run of minutes, if it is shorter than the planned one."""
+    small = Planned.of(scene, None, SMALL_STEPS, long_side=SMALL_SIDE)
+    if small.seconds >= planned.seconds:
+        return []
+    seconds = small.seconds + _seconds_before(scene, seeds=seeds, refine=refine)
+    size = f"--long-side {SMALL_SIDE} " if factor_for_side(scene.images, SMALL_SIDE) > 1 else ""
+    how = f"{'--refine-poses ' * refine}{size}--max-steps {SMALL_STEPS} -o SMALL"
+    return [(f"or about {format_duration(seconds)}", f"splatseed train {source} {how}")]
 
 
 def _seeding(source: Source, advice: Advice, planned: Planned, *, refine: bool) -> str:
