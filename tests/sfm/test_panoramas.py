@@ -72,7 +72,8 @@ def write_transforms(walk, folder, model):
         }
         for k, pose in enumerate(poses(NUM))
     ]
-    (folder / "transforms.json").write_text(json.dumps({"camera_model": model, "frames": frames}))
+    stated = {} if model is None else {"camera_model": model}
+    (folder / "transforms.json").write_text(json.dumps({**stated, "frames": frames}))
     return folder
 
 
@@ -106,7 +107,7 @@ def test_a_model_of_panoramas_is_cut(scene, tmp_path):
     assert cut.masks is None or not cut.masks.files
 
 
-@pytest.mark.parametrize("model", ["EQUIRECTANGULAR", "SPHERICAL"])
+@pytest.mark.parametrize("model", ["EQUIRECTANGULAR", "SPHERICAL", None])
 def test_transforms_without_points_are_cut(model, walk, tmp_path):
     folder = write_transforms(walk, tmp_path, model)
     scene = load_scene(folder, require_points=False, panoramas=True)
