@@ -203,7 +203,7 @@ def find_panoramas(
         raise ParameterError(
             "panoramas of all directions, twice as wide as high, with `panoramas='all'`",
             found=f"{odd[0]} of {width} x {height}",
-            fix="Remove the photographs that are none, or leave `panoramas` out.",
+            fix="Remove the photographs that are not panoramas, or leave `panoramas` out.",
         )
     findings: list[Finding] = []
     stated = dict.fromkeys(wide, True)
