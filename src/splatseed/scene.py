@@ -440,6 +440,8 @@ class Scene:
         cut = {n: f"{m['folder'] or ''}{m['panorama']}" for n, m in found.items() if m}
         faces = (image.name for image in self.images if image.intrinsics.is_face)
         panoramas = {cut[name] for name in faces if name in cut}
+        if panoramas:  # then others may be absent with all their faces
+            panoramas |= {cut[name] for name in self.absent if name in cut}
         return {name: cut[name] if cut.get(name) in panoramas else name for name in names}
 
     def split(self, test_every: int = TEST_EVERY) -> tuple[tuple[Image, ...], tuple[Image, ...]]:
