@@ -115,6 +115,7 @@ COMMANDS = [
     ((*LIFT, "--depth-kind", "ray"), "--depth DIR"),
     ((*LIFT, "--depth", "ROOM", "--depth-scale", "0"), "scale"),
     ((*LIFT, "--depth", "ROOM", "--depth.tolerance", "2"), "tolerance"),
+    ((*LIFT, "--depth.region", "0.5"), "--depth.central-fraction"),
     ((*TRAIN, "--max-step", "4"), "--max-steps"),
     ((*TRAIN, "--strategy", "defalt"), "--strategy"),
     ((*TRAIN, "--data-factor", "1000"), "--data-factor"),
