@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import shutil
 import subprocess
@@ -24,6 +25,7 @@ from splatseed.console import (
 from splatseed.findings import Finding
 from splatseed.progress import extraction_progress, silent
 from splatseed.text import quoted, visible
+from splatseed.training.settings import TrainSettings
 
 LONG = "/".join(["a_rather_long_folder_name"] * 9)
 EVIL = "a\x1b[31mb\x1b]0;title\x07 :fire: [red]c[/red] \u202ereversed\rd\n{e} \\ ' \"f"
@@ -209,6 +211,16 @@ def test_arguments_of_the_library_are_printed_as_options(capsys):
         "`masks='my masks'`": "--masks 'my masks'",
         "`masks=FILE`": "--masks FILE",
         "`mls.k=8`": "--mls.k 8",
+        "`sh_degree`": "sh_degree",
+        "`sh_degree=2`": "`sh_degree = 2` in a --config file",
+        "`opacity_reset=True`": "`opacity_reset = true` in a --config file",
     }
     for argument, option in options.items():
         assert console.with_options(argument) == option
+
+
+def test_settings_that_are_no_options_are_known(splatseed):
+    options = splatseed("train", "--help").out
+    names = {field.name for field in dataclasses.fields(TrainSettings)}
+    flags = {name: console.OPTIONS.get(name, name).replace("_", "-") for name in names}
+    assert {n for n, flag in flags.items() if f"--{flag} " not in options} == console.FILE_SETTINGS

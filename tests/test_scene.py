@@ -109,6 +109,38 @@ def test_of_few_images_none_tests_by_default(count, tests):
     assert ([image.name for image in every[0]], every[1]) == (sorted(i.name for i in images), ())
 
 
+def _faces(*panoramas, width=100, focal=42.0):
+    """Photographs as ``undistort`` cuts them: 100 degrees wide, whose tangent of half is 1.19."""
+    lens = Intrinsics(2, "PINHOLE", width, 100, (focal, focal, width / 2, 50.0))
+    return [
+        dataclasses.replace(_image(f"{folder}{face}_{name}"), intrinsics=lens)
+        for folder, name in panoramas
+        for face in ("front", "right", "back", "left", "up", "down")
+    ]
+
+
+def test_all_faces_of_a_panorama_test_or_none():
+    walk = [("", "a.jpg"), ("", "b.jpg"), ("c/", "a.jpg"), ("c/", "up_b.jpg")]
+    scene = Scene(PointCloud.empty(), (*_faces(*walk), _image("b.jpeg")))
+    assert (scene.num_viewpoints, scene.default_test_every) == (5, 0)
+    tested = {image.name for image in _faces(walk[0], walk[2])}  # 1st and 4th of 5
+    gone = ["back_a.jpg", "c/front_a.jpg", "b.jpeg", *(im.name for im in _faces(walk[1]))]
+    for some in (scene, scene.without(gone)):
+        there = {image.name for image in some.images}
+        assert {image.name for image in some.split(3)[1]} == there & tested
+    many = Scene(PointCloud.empty(), tuple(_faces(*(("", f"{k:02}.jpg") for k in range(12)))))
+    assert many.default_test_every == 8
+    assert {im.name.partition("_")[2] for im in many.split()[1]} == {"00.jpg", "08.jpg"}
+    assert [len(part) for part in many.split()] == [60, 12]
+
+
+@pytest.mark.parametrize("lens", [{"width": 120}, {"focal": 50.0}])
+def test_other_photographs_with_names_of_faces_are_counted_one_by_one(lens):
+    scene = Scene(PointCloud.empty(), tuple(_faces(("", "1.jpg"), ("", "2.jpg"), **lens)))
+    assert (scene.num_viewpoints, scene.default_test_every) == (12, 8)
+    assert [image.name for image in scene.split()[1]] == ["back_1.jpg", "right_1.jpg"]
+
+
 @pytest.mark.parametrize("test_every", [-8, 1, 2.5])
 def test_a_split_that_leaves_nothing_to_train_on_is_refused(test_every):
     with pytest.raises(ParameterError, match="test_every as a whole number of 2 or more"):

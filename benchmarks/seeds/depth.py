@@ -55,7 +55,7 @@ ARMS: dict[str, tuple[str, str, dict[str, object]]] = {
     "- all images": ("depth", "default", {"max_residual_ratio": None, "min_points": 1}),
     "- no synchronisation": ("depth", "default", {"synchronize_scales": False}),
     "- unit ray (eq. 9)": ("depth", "default", {"unit_ray": True}),
-    "- the central half": ("depth", "default", {"region": 0.5}),
+    "- the central half": ("depth", "default", {"central_fraction": 0.5}),
     "- uniform pixels": ("depth", "default", {"placement": "uniform"}),
     "- at jumps too": ("depth", "default", {"edge_tolerance": None}),
     "- confirmed by 1": ("depth", "default", {"min_agreeing": 1}),

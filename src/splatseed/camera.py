@@ -58,7 +58,11 @@ PANORAMA = CameraModel(17, "EQUIRECTANGULAR", 2, 0)
 can show them: ``load_scene`` refuses them unless they are to be cut (``sfm.panoramas``)."""
 MODELS = {**CAMERA_MODELS, PANORAMA.name: PANORAMA}
 """All of COLMAP 4.2's camera models."""
-
+FACE_HALF_VIEW = 50.0
+"""Degrees between the axis of a photograph that is cut from a panorama and the middle of its sides:
+45 and a margin that the next one shows, too."""
+_FACE_TOLERANCE = 0.02
+"""Of their width: it is rounded, and refined focal lengths differ a little."""
 
 _TWO_FOCAL = {
     "SIMPLE_PINHOLE": "PINHOLE",
@@ -116,6 +120,12 @@ class Intrinsics:
     def is_panorama(self) -> bool:
         """Whether it shows all directions, by longitude and latitude."""
         return self.model == PANORAMA.name
+
+    @property
+    def is_face(self) -> bool:
+        """Whether it is as those that ``sfm`` and ``undistort`` cut from panoramas."""
+        half = math.tan(math.radians(FACE_HALF_VIEW)) * self.K[0, 0]  # pixels
+        return self.width == self.height and abs(2 * half / self.width - 1) < _FACE_TOLERANCE
 
     @property
     def has_distortion(self) -> bool:

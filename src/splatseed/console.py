@@ -41,6 +41,10 @@ ARGUMENT = re.compile(r"`(?P<name>[a-z]\w*(?:\.[a-z]\w*)*)(?:=(?P<value>[^`]+))?
 """An argument in a message of the library, with its value if one is suggested."""
 OPTIONS = {"cap_max": "budget", "seeding": "seeds", "depths": "depth"}
 """Options whose names differ from the arguments they set."""
+FILE_SETTINGS = frozenset(
+    {"opacity_reset", "placing", "seed_colors", "seed_normals", "seed_sizes", "sh_degree"}
+)
+"""Arguments that are no options: on the command line only files set them."""
 
 
 @dataclass(frozen=True)
@@ -377,14 +381,21 @@ def with_options(message: str) -> str:
         'Pass a smaller --ratio, --mls.k 8 or --overwrite.'
         >>> with_options("Pass `depth.align=False` or `masks='my masks'`.")
         "Pass --depth.no-align or --masks 'my masks'."
+        >>> with_options("With `placing='none'` it only splits.")
+        'With `placing = "none"` in a --config file it only splits.'
     """
     return ARGUMENT.sub(_option, message)
 
 
 def _option(argument: re.Match[str]) -> str:
     group, dot, name = argument["name"].rpartition(".")
-    name = OPTIONS.get(name, name).replace("_", "-")
     value = argument["value"]
+    if name in FILE_SETTINGS:
+        if value is None:
+            return name
+        in_toml = json.dumps(ast.literal_eval(value))
+        return f"`{name} = {in_toml}` in a --config file"
+    name = OPTIONS.get(name, name).replace("_", "-")
     if value in {None, "True", "False"}:
         return f"--{group}{dot}{'no-' * (value == 'False')}{name}"
     try:

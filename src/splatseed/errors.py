@@ -11,8 +11,9 @@ The message says in one line what was expected, what was found, and how to fix i
 
 A message names an argument in backticks, as Python code: `ratio`, `max_steps=7000`,
 `overwrite=True`. The command line prints the option instead (`--ratio`, `--max-steps 7000`,
-`--overwrite`; ``console.with_options``), so messages of the library contain no options. Text values
-are quoted: ``f"`masks={str(folder)!r}`"``. Notes follow the same rule.
+`--overwrite`, or a line of its --config file; ``console.with_options``), so messages of the library
+contain no options. Text values are quoted: ``f"`masks={str(folder)!r}`"``. Notes follow the same
+rule.
 
 The classes in parentheses are Python's, which callers may catch. Inside splatseed, an ``except
 OSError`` or ``except ValueError`` that converts errors must re-raise a ``SplatseedError``.

@@ -9,6 +9,7 @@ its images open, when needed: cameras are in pixels of the photographs' files.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace as dataclass_replace
@@ -36,12 +37,15 @@ OPENCV = "with OpenCV's camera axes (x right, y down, z forward)"
 OPENGL = "with OpenGL's camera axes (x right, y up, z back)"
 
 TEST_EVERY = 8
-"""By default every 8th image by name tests, from the first."""
+"""By default every 8th image by name tests, from the first; of panoramas all faces or none."""
 MIN_HELD_OUT = 12
 """Fewest images of which ``train`` holds some out by default. PSNR rises by about 4 dB where
 photographs double, in published tables (3 to 6 of LLFF: 20.4 to 24.5; 12 to 24 of Mip-NeRF360: 19.5
 to 23.4). So to hold out every 8th costs about 2 dB with 3 photographs and 1 with 6 to 11, for a
-score that rests on one or two of them."""
+score that rests on one or two of them. The faces of a panorama count as one image: they add no
+other viewpoint."""
+_FACE_NAME = re.compile(r"(?P<folder>.*/)?(front|right|back|left|up|down)_(?P<panorama>[^/]+)")
+"""Names of faces, as ``sfm.panoramas`` gives them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -418,13 +422,33 @@ class Scene:
     @property
     def default_test_every(self) -> int:
         """The ``test_every`` of ``train``: every 8th image tests, none of few."""
-        return TEST_EVERY if len(self.images) >= MIN_HELD_OUT else 0
+        return TEST_EVERY if self.num_viewpoints >= MIN_HELD_OUT else 0
+
+    @property
+    def num_viewpoints(self) -> int:
+        """Number of images, where all faces of a panorama count as one."""
+        return len({self._uncut[image.name] for image in self.images})
+
+    @cached_property
+    def _uncut(self) -> dict[str, str]:
+        """By name, what each image, also an absent one, was cut from: a panorama, or itself.
+
+        Neither refined poses nor left out faces may change this, as they must not change the split.
+        """
+        names = [*(image.name for image in self.images), *self.absent]
+        found = {name: _FACE_NAME.fullmatch(name) for name in names}
+        cut = {n: f"{m['folder'] or ''}{m['panorama']}" for n, m in found.items() if m}
+        faces = (image.name for image in self.images if image.intrinsics.is_face)
+        panoramas = {cut[name] for name in faces if name in cut}
+        if panoramas:  # then others may be absent with all their faces
+            panoramas |= {cut[name] for name in self.absent if name in cut}
+        return {name: cut[name] if cut.get(name) in panoramas else name for name in names}
 
     def split(self, test_every: int = TEST_EVERY) -> tuple[tuple[Image, ...], tuple[Image, ...]]:
         """Return training and test images by name: as listed, else every ``test_every``-th tests.
 
         With 0, none tests. Images that are ``absent`` count, so that the other images stay in their
-        part.
+        part. Faces cut from one panorama count as one image, as they show margins of one another.
 
         Raises:
             ParameterError: ``test_every`` is no whole number of 2 or more, and not 0.
@@ -442,9 +466,9 @@ class Scene:
                 found=repr(test_every),
                 fix="With 8, every 8th image is kept for testing, with 0 none.",
             )
-        tested = {*sorted([*(image.name for image in ordered), *self.absent])[::test_every]}
-        train = tuple(image for image in ordered if image.name not in tested)
-        return train, tuple(image for image in ordered if image.name in tested)
+        tested = {*sorted({*self._uncut.values()})[::test_every]}
+        train = tuple(image for image in ordered if self._uncut[image.name] not in tested)
+        return train, tuple(image for image in ordered if self._uncut[image.name] in tested)
 
 
 def _size_range(images: Sequence[Image]) -> str:

@@ -115,6 +115,7 @@ COMMANDS = [
     ((*LIFT, "--depth-kind", "ray"), "--depth DIR"),
     ((*LIFT, "--depth", "ROOM", "--depth-scale", "0"), "scale"),
     ((*LIFT, "--depth", "ROOM", "--depth.tolerance", "2"), "tolerance"),
+    ((*LIFT, "--depth.region", "0.5"), "--depth.central-fraction"),
     ((*TRAIN, "--max-step", "4"), "--max-steps"),
     ((*TRAIN, "--strategy", "defalt"), "--strategy"),
     ((*TRAIN, "--data-factor", "1000"), "--data-factor"),
@@ -493,3 +494,10 @@ def test_control_characters_of_names_are_escaped(words, room, tmp_path, splatsee
 
     assert r"room\x1b[31m:fire:[red]\nx" in run.out
     _refused(splatseed("info", tmp_path / f"no{NAME}"), r"noroom\x1b[31m:fire:[red] x")
+
+
+def test_a_value_that_a_method_refuses_is_printed_once(splatseed, room, tmp_path):
+    words = ("--method", "depth", "--depth.central-fraction", "2", "-o", tmp_path / "out")
+    run = splatseed("upsample", room, *words)
+    assert run.code == 2
+    assert run.err.count("depth.central_fraction above 0 and at most 1") == 1

@@ -14,6 +14,7 @@ from splatseed.camera import Intrinsics
 from splatseed.commands import next_steps
 from splatseed.commands.next_steps import (
     Planned,
+    Source,
     advice_commands,
     print_training,
     training_commands,
@@ -84,12 +85,26 @@ def test_minutes_are_those_of_seeds_and_refinement_too(room, monkeypatch):
 
     def label(method, *, refine):
         advised = dataclasses.replace(advice, method=method)
-        return advice_commands(room, scene, advised, planned, refine=refine)[0][0]
+        return advice_commands(Source(room), scene, advised, planned, refine=refine)[0][0]
 
     count = len(scene.images)  # each takes 0.5 s of seeds, and 1.5 s of refinement
     assert label(AS_IT_IS, refine=False) == "train, about 12 s"
     assert label("auto", refine=False) == f"train, about {round(12 + 0.5 * count)} s"
     assert label("auto", refine=True) == f"train, about {round(12 + 2.0 * count)} s"
+
+
+@pytest.mark.parametrize(("side", "steps"), [(480, 30000), (40, 30000), (480, 1000)])
+def test_the_short_run_is_shorter_and_enlarges_nothing(side, steps, room, monkeypatch):
+    monkeypatch.setattr(next_steps, "which", lambda _: None)  # as without a GPU
+    monkeypatch.setattr(next_steps, "SMALL_SIDE", side)
+    scene = load_scene(room)
+    assert max(image.lens.width for image in scene.images) in range(41, 480)
+    advice = dataclasses.replace(advice_for(scene, 1000), method=AS_IT_IS)
+    planned = Planned.of(scene, max_steps=steps)
+    commands = advice_commands(Source(room), scene, advice, planned, refine=False)
+    short = [line for _, line in commands if "SMALL" in line]
+    size = "--long-side 40 " if side == 40 else ""
+    assert short == [f"splatseed train {room} {size}--max-steps 1500 -o SMALL"][: steps > 1500]
 
 
 @pytest.mark.parametrize(("trainer", "points"), [("gsplat", True), ("nerfstudio", False)])
@@ -116,6 +131,27 @@ def test_the_advice_is_for_the_trainer_that_is_named(
     }
     assert f"{command[trainer]} " in out
     assert f"{tmp_path / 'OUT'}" in out
+
+
+def test_only_commands_that_read_the_scene_exclude(room, bent):
+    """Whatever the scene's name, also that of a verb."""
+    source = Source(Path("train"), ("my photo.png", "b*"))
+    options = "--exclude 'my photo.png' --exclude 'b*'"
+    scene, read = load_scene(room), f"train {options} "
+    advice = dataclasses.replace(advice_for(scene, 1000), method="mls")
+    commands = advice_commands(source, scene, advice, Planned.of(scene), refine=False)
+    assert [(line.split()[1], read in line) for _, line in commands] == [
+        ("upsample", True), ("train", False),
+    ]  # fmt: skip
+    assert commands[1][1].startswith("splatseed train OUT --budget")
+    advice = dataclasses.replace(advice, method=AS_IT_IS)
+    gsplat = Planned.of(scene, trainer="gsplat")  # which leaves nothing out by itself
+    commands = advice_commands(source, scene, advice, gsplat, refine=False)
+    assert commands[0][1] == f"splatseed upsample {read}--method linear --ratio 1 -o OUT"
+    scene = load_scene(bent)
+    commands = advice_commands(source, scene, advice, Planned.of(scene), refine=False)
+    assert commands[0][1] == f"splatseed undistort {read}-o train_undistorted"
+    assert not any("--exclude" in line for _, line in commands[1:])
 
 
 @pytest.mark.parametrize("kept", ["some", "no folder"])
@@ -154,11 +190,11 @@ def test_graphdecos_trainer_ignores_principal_points(off, told, room, capsys):
     fx, fy, cx, cy = lens.params
     lens = dataclasses.replace(lens, params=(fx, fy, cx, cy - off))
     images = tuple(dataclasses.replace(each, intrinsics=lens) for each in scene.images)
-    print_training(room, scene.replace(images=images), Path("out"), "colmap")
+    print_training(Source(room), scene.replace(images=images), Path("out"), "colmap")
     said = capsys.readouterr()
     assert "graphdeco" in said.out
     assert (f"ignores principal points, which are up to {off} px off" in said.err) == told
-    print_training(room, scene.replace(images=images), Path("out"), "transforms")
+    print_training(Source(room), scene.replace(images=images), Path("out"), "transforms")
     assert "ignores" not in capsys.readouterr().err  # that trainer does not read it
 
 

@@ -133,7 +133,7 @@ def test_all_pixels_can_be_lifted_but_no_more(exact):
     options = {"min_agreeing": 0, "see_through": True, "edge_tolerance": None}
     new = lifted(scene, pixels, **options)
     assert len(np.unique(new.xyz, axis=0)) == pixels
-    for profile, change in (("default", options), ("paper", {"region": 1.0})):
+    for profile, change in (("default", options), ("paper", {"central_fraction": 1.0})):
         with pytest.raises(PointCloudError, match=rf"{pixels + 1:,}.*{pixels:,}"):
             lifted(scene, pixels + 1, profile, **change)
 

@@ -246,6 +246,19 @@ DIAGONALS = ([2.0, 2, 2, 2], [1.0, 1, -1, 1], [0.0, 1, 1, 1])
 
 
 @pytest.mark.parametrize(
+    ("size", "stated"), [((640, 320), {"camera_model": "PINHOLE"}), ((640, 480), {})]
+)
+def test_a_file_without_focal_lengths_is_not_guessed(content, tmp_path, size, stated):
+    """Unless all that it states fits panoramas."""
+    path = tmp_path / "t.json"
+    lens = dict.fromkeys(("fl_x", "fl_y", "cx", "cy")) | dict(zip("wh", size, strict=True))
+    path.write_text(json.dumps({**content, **lens, **stated}))
+    expected = r"a focal length \(fl_x in pixels.* frame 1 .*; found none\. .*EQUIRECTANGULAR"
+    with pytest.raises(SceneFormatError, match=expected):
+        read_transforms(path)
+
+
+@pytest.mark.parametrize(
     ("change", "frame"),
     [
         *(({"fl_x": value}, {}) for value in (None, -5, 0, float("nan"))),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import inspect
 import sys
 from importlib.metadata import EntryPoint
 
@@ -44,7 +46,7 @@ WRONG_PARAMETERS = {
     "depth.fit": ("ransac",),
     "depth.min_points": (0,),
     "depth.max_residual_ratio": (0.5,),
-    "depth.region": (0, 1.5),
+    "depth.central_fraction": (0, 1.5),
     "depth.edge_tolerance": (0,),
     "depth.edge_radius": (0,),
     "depth.num_neighbors": (0,),
@@ -71,6 +73,8 @@ WRONG_CALLS = [
     *(({"num_points": wrong}, "at least the 160 originals") for wrong in (159, -1)),
     *(({"num_points": wrong}, "a whole number") for wrong in (200.5, "800")),
     ({"ratio": 2, "num_points": 320}, "found both"),
+    ({"method": "depth", "region": 0.5}, r"`region` as text.*found 0\.5.*central_fraction"),
+    ({"region": (0, 0, 0, 1, 1, 1)}, r"'x0,y0,z0,x1,y1,z1' for a box.*found \(0, 0, 0"),
     *(({"seed": wrong}, "a seed") for wrong in (-1, "one")),
     *(({"method": Copies(), **own}, "no parameters next to") for own in ({"k": 9}, PAPER)),
 ]
@@ -82,6 +86,12 @@ def test_wrong_calls_are_named(options, says, wavy):
         ss.upsample(wavy, **options)
 
 
+def test_no_parameter_of_a_method_has_the_name_of_an_argument_of_upsample():
+    arguments = set(inspect.signature(ss.upsample).parameters)
+    for name in [*BUILT_IN, *PHOTOGRAPH_METHODS, "cloud"]:
+        assert not arguments & {field.name for field in dataclasses.fields(METHODS[name])}
+
+
 @pytest.mark.parametrize("method", BUILT_IN)
 @pytest.mark.parametrize("size", [{"ratio": 1}, {"num_points": 160}], ids=str)
 def test_nothing_to_add_gives_the_originals(method, size, wavy):
@@ -91,7 +101,7 @@ def test_nothing_to_add_gives_the_originals(method, size, wavy):
 
 
 PAPER_DEPTH = {
-    "fit": "least-squares", "unit_ray": True, "region": 0.5, "placement": "uniform",
+    "fit": "least-squares", "unit_ray": True, "central_fraction": 0.5, "placement": "uniform",
     "min_agreeing": 0, "see_through": True, "spread": False, "edge_tolerance": None,
 }  # fmt: skip
 

@@ -16,7 +16,7 @@ from splatseed.io import load_scene
 from splatseed.photos.panorama import FACES
 from splatseed.sfm import reconstruct, undistort
 from splatseed.sfm.colmap import Settings
-from splatseed.sfm.panoramas import find_panoramas
+from splatseed.sfm.panoramas import face_names, find_panoramas, split_of_faces
 from splatseed.sfm.photos import find_photos
 from splatseed.similarity import fit_similarity
 
@@ -72,7 +72,8 @@ def write_transforms(walk, folder, model):
         }
         for k, pose in enumerate(poses(NUM))
     ]
-    (folder / "transforms.json").write_text(json.dumps({"camera_model": model, "frames": frames}))
+    stated = {} if model is None else {"camera_model": model}
+    (folder / "transforms.json").write_text(json.dumps({**stated, "frames": frames}))
     return folder
 
 
@@ -98,13 +99,15 @@ def test_a_model_of_panoramas_is_cut(scene, tmp_path):
     assert len(cut.points) == 40
     assert (cut.tracks.lengths == NUM).all()
     assert cut.tracks.errors.max() < 1e-6
-    assert cut.listed is not None
-    assert cut.listed.test == {f"{face}_p0.jpg" for face in FACES}
-    assert len(cut.listed.train) == 6 * (NUM - 1)
+    assert cut.listed is None
+    assert (cut.num_viewpoints, cut.default_test_every) == (NUM, 0)
+    train, test = cut.split(NUM)
+    assert {image.name for image in test} == {f"{face}_p0.jpg" for face in FACES}
+    assert len(train) == 6 * (NUM - 1)
     assert cut.masks is None or not cut.masks.files
 
 
-@pytest.mark.parametrize("model", ["EQUIRECTANGULAR", "SPHERICAL"])
+@pytest.mark.parametrize("model", ["EQUIRECTANGULAR", "SPHERICAL", None])
 def test_transforms_without_points_are_cut(model, walk, tmp_path):
     folder = write_transforms(walk, tmp_path, model)
     scene = load_scene(folder, require_points=False, panoramas=True)
@@ -124,6 +127,13 @@ def test_other_verbs_name_the_command(scene, tmp_path, splatseed, monkeypatch):
     run = splatseed("undistort", ".", "-o", tmp_path / "cut", "--mask-below", "40")
     assert run.code == 0, run.err
     assert "4 panoramas are each cut into 6 photographs of 146 x 146 px" in run.err
+
+
+@pytest.mark.parametrize(("count", "tests"), [(11, ()), (12, ("00", "08"))])
+def test_every_eighth_panorama_is_listed_for_other_trainers(count, tests):
+    split = split_of_faces({f"{k:02}.jpg": face_names(f"{k:02}.jpg") for k in range(count)})
+    tested = {face for name in tests for face in face_names(f"{name}.jpg")}
+    assert (split and (split.test, len(split.train))) == ((tested, 60) if tests else None)
 
 
 def test_what_is_below_is_masked(scene, tmp_path):
@@ -174,8 +184,8 @@ def test_a_walk_in_panoramas_is_reconstructed(walk, tmp_path):
     assert len(xyz) > 300
     assert np.median(off) < 0.02
     assert np.mean(off < 0.1) > 0.9
-    assert made.listed is not None
-    assert made.listed.test == {f"{face}_p0.jpg" for face in FACES}
+    assert made.listed is None
+    assert {image.name for image in made.split()[1]} == {f"{face}_p0.jpg" for face in FACES}
     model = pycolmap.Reconstruction(report.path / "sparse" / "0")
     assert (model.num_rigs(), model.num_frames(), model.num_images()) == (1, NUM, 6 * NUM)
     assert made["down_p1.jpg"].read_mask() is not None

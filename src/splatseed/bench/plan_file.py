@@ -112,7 +112,7 @@ def _check(
         kind = get_args(hint)[0] if listed else hint
         parts = value if listed and isinstance(value, list) else [value]
         if isinstance(value, list) != listed or not all(fits(part, kind) for part in parts):
-            expected = f"{'a list of items that are ' if listed else ''}{describe_type(kind)}"
+            expected = f"{'a list, each item ' if listed else ''}{describe_type(kind)}"
             raise SceneFormatError(
                 f"{within}{key} = {expected} in {path}", found=repr(value), fix="Correct the plan."
             )

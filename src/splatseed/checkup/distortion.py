@@ -149,7 +149,7 @@ def distortion_finding(
     if found.radial is None:
         text = (
             "The photographs do not have the lens distortion of their cameras: they confirm "
-            f"{shares} without it; {misses} then."
+            f"{shares} without it; {misses} without it."
         )
         fix = (
             "Give the cameras no distortion (PINHOLE), or use the photographs before undistortion."
@@ -163,7 +163,7 @@ def distortion_finding(
     more = " beyond these" if any(image.intrinsics.has_distortion for image in images) else ""
     text = (
         f"The photographs have lens distortion that their cameras lack, about {k}{more}: they "
-        f"confirm {shares} once it is removed; {misses} then."
+        f"confirm {shares} once it is removed; {misses} after that."
     )
     undistort = f": {undistort_command(scene.source.root)}" if scene.source.root else ""
     fix = (

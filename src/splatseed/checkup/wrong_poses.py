@@ -111,10 +111,8 @@ def _focal_factor(evidence: Evidence, i: int) -> float | None:
 
 def _focal_finding(factors: Mapping[str, float]) -> Finding:
     each = name_some([f"{name} ({factor:.3g} times)" for name, factor in factors.items()], NAMED)
-    text = (
-        f"Points that other photographs confirm fit {counted(len(factors), 'photograph')} with "
-        f"another focal length: {each}."
-    )
+    count = f"{counted(len(factors), 'photograph')} {agreeing(len(factors), 'has', 'have')}"
+    text = f"By the points that others confirm, {count} another focal length: {each}."
     fix = "Correct it, or leave them out of seeds and training: `drop_wrong_poses=True`."
     return Finding(WRONG_FOCAL_LENGTH, text, "error", tuple(factors), fix=fix)
 
@@ -122,10 +120,9 @@ def _focal_finding(factors: Mapping[str, float]) -> Finding:
 def _pose_finding(wrong: tuple[str, ...]) -> Finding:
     which = agreeing(len(wrong), "its pose is", "their poses are")
     shows = agreeing(len(wrong), "it shows", "they show")
-    text = (
-        f"Points that other photographs confirm do not fit {counted(len(wrong), 'photograph')}: "
-        f"{name_some(wrong, NAMED)}; {which} wrong, or {shows} other things."
-    )
+    count = f"{counted(len(wrong), 'photograph')} {agreeing(len(wrong), 'does', 'do')}"
+    text = f"{count} not fit the points that others confirm: {name_some(wrong, NAMED)}; "
+    text += f"{which} wrong, or {shows} other things."
     leave = "`drop_wrong_poses=True` leaves them out of seeds and training."
     return Finding(WRONG_POSES, text, "error", wrong, fix=leave)
 

@@ -150,7 +150,7 @@ def run(arguments: list[str]) -> None:
         _report(arguments[1:])
         return
     if arguments and not arguments[0].startswith("-"):
-        fix = f"{did_you_mean(arguments[0], ['report'])}Name scenes with --scenes."
+        fix = f"{did_you_mean(arguments[0], ['report'])}Name scenes by --scenes, a plan by --plan."
         expected = "report after splatseed bench, or options"
         raise ParameterError(expected, found=repr(arguments[0]), fix=fix)
     options, plan = parse_plan(arguments)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from splatseed.commands.next_steps import after_depth, excluding, show_maps
+from splatseed.commands.next_steps import Source, after_depth, show_maps
 from splatseed.commands.options import check_minimum, parse_options, refuse
 from splatseed.console import OUT, add_results, print_next, print_note, print_pairs, stage_display
 from splatseed.depth.stereo.maps import MIN_SIZE
@@ -123,8 +123,8 @@ def _run_network(options: Options, model: str) -> None:
         text = f"the network predicted no depth (a constant map, or none) for: {flat}"
         print_note(Finding("no-depth", text, subjects=tuple(report.flat)))
     known = num * min(math.prod(size) for size in sizes)
-    commands = after_depth(options.scene, scene, options.output, known, aligned=False)
-    print_next(excluding(commands, options.scene, options.exclude))
+    source = Source(options.scene, options.exclude)
+    print_next(after_depth(source, scene, options.output, known, aligned=False))
 
 
 def _run_stereo(options: Options) -> None:
@@ -177,15 +177,15 @@ def _summarise_stereo(
         fuse = f"--workspace_path {quoted(path)} --output_path {quoted(path / 'fused.ply')}"
         fuse = f"colmap stereo_fusion {fuse} --StereoFusion.min_num_pixels {MIN_PIXELS}"
         # The workspace is itself a scene, without distortion.
-        print_next([show_maps(path, path), ("fuse", fuse)])
+        print_next([show_maps(Source(path), path), ("fuse", fuse)])
         return
     if is_distorted(scene):
         text = "the cameras have lens distortion, and these maps belong to the undistorted "
         text += "photographs: --colmap writes both, as a scene to continue with"
         print_note(Finding("lens-distortion", text, "info"))
     known = report.num_known
-    commands = after_depth(options.scene, scene, path, known, aligned=True)
-    print_next(excluding(commands, options.scene, options.exclude))
+    source = Source(options.scene, options.exclude)
+    print_next(after_depth(source, scene, path, known, aligned=True))
 
 
 def _size_range(sizes: Sequence[Sequence[int]]) -> str:

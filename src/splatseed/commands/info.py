@@ -25,7 +25,7 @@ from splatseed.commands.info_rows import (
     source_rows,
     track_rows,
 )
-from splatseed.commands.next_steps import Commands, Planned, TrainerName, excluding
+from splatseed.commands.next_steps import Commands, Planned, Source, TrainerName
 from splatseed.commands.options import check_free, parse_options, refuse
 from splatseed.console import (
     OUT,
@@ -200,8 +200,10 @@ def _show(options: Options, scene: Scene, facts: _Facts) -> None:
             print_note(missing)
         commands = _next(options, usable, advice, planned, facts.known, check.poses)
         if check.first and len(scene.points):
-            commands = [("once that is mended", f"splatseed info {quoted(options.scene)}")]
-        print_next(excluding(commands, options.scene, options.exclude))
+            commands = [
+                ("once that is mended", f"splatseed info {Source(options.scene, options.exclude)}")
+            ]
+        print_next(commands)
 
 
 def _shows_model(options: Options) -> bool:
@@ -328,24 +330,24 @@ def _next(
     """Return the next commands, or the choices if there are several."""
     any_points, refine = len(scene.points) > 0, poses is not None and poses.inexact
     sound = poses is None or not poses.doubts
-    lifted = ""
+    source, lifted = Source(options.scene, options.exclude), ""
     metric = in_scene_units(scene.depths) and not any_points
     if metric and not is_distorted(scene) and scene.has_photographs:
-        lifted = f"splatseed upsample {quoted(options.scene)} --method depth -o OUT"
+        lifted = f"splatseed upsample {source} --method depth -o OUT"
     elif options.depth is not None and scene.depths and not is_distorted(scene):
         how = "" if options.depth_kind is None else f"--depth-kind {options.depth_kind} "
         how += "" if options.depth_scale is None else f"--depth-scale {options.depth_scale:g} "
         how += "" if any_points else "--depth.no-align "
         how += next_steps.number_option(len(scene.points), known, planned.max_seeds)
-        lifted = next_steps.lifting_command(options.scene, options.depth, how)
+        lifted = next_steps.lifting_command(source, options.depth, how)
     if any_points and lifted:
         return [("", lifted)]
     advised: Commands = []
     if any_points or (scene.has_photographs and (refine or sound)):
-        advised = next_steps.advice_commands(options.scene, scene, advice, planned, refine=refine)
+        advised = next_steps.advice_commands(source, scene, advice, planned, refine=refine)
     if any_points:
         return advised
-    points = next_steps.triangulate_command(options.scene, scene, "OUT")
+    points = next_steps.triangulate_command(source, scene, "OUT")
     points = f"{points} --refine-poses" if refine else points
     maps = [("or from the maps", lifted)] if lifted and (known or metric) else []
     return [*advised, *maps, ("or points" if advised or maps else "points", points)]

@@ -64,8 +64,9 @@ def source_rows(scene: Scene) -> list[tuple[str, str]]:
     ]
     few = _has_pixel_seeds(scene)
     if few is not False:
-        seeds = "method auto gives every second pixel a seed; docs/few_photographs.md"
-        rows.append(("few photographs", seeds if few else f"unless they are close, {seeds}"))
+        seeds = "method auto gives every second pixel a seed"
+        unless = "" if few else ", unless the photographs are close together"
+        rows.append(("few photographs", f"{seeds}{unless} (docs/few_photographs.md)"))
     return rows
 
 

@@ -16,7 +16,7 @@ from splatseed.findings import Finding
 from splatseed.io.downsampling import reduced_size
 from splatseed.io.staging import read_manifest
 from splatseed.io.transforms_layout import Layout
-from splatseed.lens import undistort_command, undistorted_folder
+from splatseed.lens import undistorted_folder
 from splatseed.photos.sizes import default_factor, factor_for_side, factor_for_size
 from splatseed.progress import available_cpus
 from splatseed.scene import Image, Scene
@@ -50,6 +50,22 @@ CENTRED = 0.5
 """Offset of a principal point from the centre, in pixels, above which a note warns."""
 
 Commands = list[tuple[str, str]]
+
+
+class Source(NamedTuple):
+    """A scene that commands read, and the photographs that they leave out."""
+
+    path: Path
+    excluded: Sequence[str] = ()  # as given to --exclude
+
+    def __str__(self) -> str:
+        """Return the words of a command line."""
+        return " ".join([quoted(self.path), *(f"--exclude {quoted(p)}" for p in self.excluded)])
+
+    @property
+    def undistortion(self) -> str:
+        """The command that undistorts it, as ``undistort_command``."""
+        return f"splatseed undistort {self} -o {quoted(undistorted_folder(self.path))}"
 
 
 class Planned(NamedTuple):
@@ -114,7 +130,7 @@ class Planned(NamedTuple):
 
 
 def advice_commands(
-    path: Path, scene: Scene, advice: Advice, planned: Planned, *, refine: bool
+    source: Source, scene: Scene, advice: Advice, planned: Planned, *, refine: bool
 ) -> Commands:
     """Return the commands that follow the advice; with ``refine``, poses are refined first.
 
@@ -123,20 +139,20 @@ def advice_commands(
     """
     if untrainable(scene):
         if advice.method in {AS_IT_IS, SEEDED}:
-            return [("look", f"splatseed view {quoted(path)}")]
-        return [("seeds", _seeding(path, advice, planned, refine=refine))]
+            return [("look", f"splatseed view {source}")]
+        return [("seeds", _seeding(source, advice, planned, refine=refine))]
     first: Commands = []
     own = planned.trainer == "splatseed"
     handled = {name.lower(): lenses for name, lenses in LENSES.items()}
     lenses = distorted_lenses(scene)
     if not lenses <= handled.get(planned.trainer, COMMON_LENSES):
-        first, path = [("undistort", undistort_command(path))], undistorted_folder(path)
+        first = [("undistort", source.undistortion)]
+        source = Source(undistorted_folder(source.path))
         lenses = frozenset()
-    source = quoted(path)
     plan = f"--budget {planned.budget} --max-steps {planned.max_steps}"
     refining = "--refine-poses " if refine else ""
     if not own:
-        return [*first, *_for_trainer(path, scene, advice, planned, lenses, refine=refine)]
+        return [*first, *_for_trainer(source, scene, advice, planned, lenses, refine=refine)]
     if advice.method == SEEDED:
         how = planned.flags
     elif advice.method == AS_IT_IS:
@@ -144,7 +160,7 @@ def advice_commands(
     elif advice.method == "auto":
         how = f"{refining}{plan} "
     else:
-        seeds = ("seeds", _seeding(path, advice, planned, refine=refine))
+        seeds = ("seeds", _seeding(source, advice, planned, refine=refine))
         return [*first, seeds, ("train", f"splatseed train OUT {plan} -o RUN")]
     train, label = f"splatseed train {source} {how}-o RUN", "train"
     shorter: Commands = []
@@ -152,19 +168,28 @@ def advice_commands(
         made = advice.method == "auto"
         first_seconds = _seconds_before(scene, seeds=made, refine=refine and made)
         label = f"train, about {format_duration(planned.seconds + first_seconds)}"
-        small = Planned.of(scene, None, SMALL_STEPS, long_side=SMALL_SIDE)
-        how = f"{refining}--long-side {SMALL_SIDE} --max-steps {SMALL_STEPS} -o SMALL"
-        command = f"splatseed train {source} {how}"
-        first_seconds = _seconds_before(scene, seeds=made, refine=refine)
-        shorter = [(f"or about {format_duration(small.seconds + first_seconds)}", command)]
+        shorter = _shorter(source, scene, planned, seeds=made, refine=refine)
     commands = [*first, (label, train), *shorter]
     if advice.method == "auto":
-        others = _seeding(path, advice, planned, refine=refine)
+        others = _seeding(source, advice, planned, refine=refine)
         return [*commands, ("seeds for another trainer", others)]
     return [*commands, ("another trainer", f"splatseed info {source} --for gsplat")]
 
 
-def _seeding(path: Path, advice: Advice, planned: Planned, *, refine: bool) -> str:
+def _shorter(
+    source: Source, scene: Scene, planned: Planned, *, seeds: bool, refine: bool
+) -> Commands:
+    """Return the command for a run of minutes, if it is shorter than the planned one."""
+    small = Planned.of(scene, None, SMALL_STEPS, long_side=SMALL_SIDE)
+    if small.seconds >= planned.seconds:
+        return []
+    seconds = small.seconds + _seconds_before(scene, seeds=seeds, refine=refine)
+    size = f"--long-side {SMALL_SIDE} " if factor_for_side(scene.images, SMALL_SIDE) > 1 else ""
+    how = f"{'--refine-poses ' * refine}{size}--max-steps {SMALL_STEPS} -o SMALL"
+    return [(f"or about {format_duration(seconds)}", f"splatseed train {source} {how}")]
+
+
+def _seeding(source: Source, advice: Advice, planned: Planned, *, refine: bool) -> str:
     how = f"--method {advice.method} --ratio 4"
     if advice.method == "auto":  # as train seeds: more gain nothing in a whole run
         fits = planned.most_seeds <= planned.max_seeds
@@ -172,7 +197,7 @@ def _seeding(path: Path, advice: Advice, planned: Planned, *, refine: bool) -> s
     elif advice.method in {AS_IT_IS, SEEDED}:
         how = "--method linear --ratio 1"
     options = [how, "--refine-poses" if refine else "", "-o OUT"]
-    return " ".join([f"splatseed upsample {quoted(path)}", *filter(None, options)])
+    return " ".join([f"splatseed upsample {source}", *filter(None, options)])
 
 
 def _seconds_before(scene: Scene, *, seeds: bool, refine: bool) -> float:
@@ -193,7 +218,7 @@ def _most_seeds(images: Sequence[Image]) -> int:
 
 
 def _for_trainer(
-    path: Path,
+    source: Source,
     scene: Scene,
     advice: Advice,
     planned: Planned,
@@ -201,16 +226,16 @@ def _for_trainer(
     *,
     refine: bool,
 ) -> Commands:
-    source = scene.source.format
-    layout: Layout = "transforms" if source == "transforms" else "colmap"
+    read = scene.source.format
+    layout: Layout = "transforms" if read == "transforms" else "colmap"
     if read_manifest(scene.source.root).get("format") == "both":
         layout = "both"
-    other = source not in {"colmap", "transforms"} or (
+    other = read not in {"colmap", "transforms"} or (
         layout == "transforms" and planned.trainer in map(str.lower, COLMAP_ONLY)
     )
-    commands: Commands = []
-    if other or advice.method not in {AS_IT_IS, SEEDED}:
-        seeds = _seeding(path, advice, planned, refine=refine)
+    commands, path = Commands(), source.path
+    if other or source.excluded or advice.method not in {AS_IT_IS, SEEDED}:
+        seeds = _seeding(source, advice, planned, refine=refine)
         if other:
             layout, seeds = "colmap", f"{seeds} --format colmap"
         commands, path = [("seeds", seeds)], Path("OUT")
@@ -218,38 +243,29 @@ def _for_trainer(
     return [*commands, ("train", named[planned.trainer])]
 
 
-def after_depth(path: Path, scene: Scene, maps: Path, known: int, *, aligned: bool) -> Commands:
-    """Return the commands that use the depth maps made for a scene at ``path``.
+def after_depth(source: Source, scene: Scene, maps: Path, known: int, *, aligned: bool) -> Commands:
+    """Return the commands that use the depth maps made for a scene.
 
     ``known`` of their pixels have a depth; ``aligned``: they are in the scene's unit, as stereo's
     are and a network's are not.
     """
-    looking = show_maps(path, maps)
+    looking = show_maps(source, maps)
     number = number_option(len(scene.points), known, Planned.of(scene).max_seeds)
     if is_distorted(scene):  # seeds are lifted along the rays of a pinhole camera
-        begin = ("for seeds, begin with", undistort_command(path))
+        begin = ("for seeds, begin with", source.undistortion)
         return [looking] if aligned else [looking, begin]
     if len(scene.points) or aligned:
         how = number if len(scene.points) else f"--depth.no-align {number}"
-        return [looking, ("use", lifting_command(path, maps, how))]
-    points = ("points to align to", triangulate_command(path, scene, "SCENE"))
-    return [looking, points, ("use", lifting_command(Path("SCENE"), maps, f"--ratio {RATIO}"))]
+        return [looking, ("use", lifting_command(source, maps, how))]
+    points = ("points to align to", triangulate_command(source, scene, "SCENE"))
+    use = lifting_command(Source(Path("SCENE")), maps, f"--ratio {RATIO}")
+    return [looking, points, ("use", use)]
 
 
-def excluding(commands: Commands, path: Path, patterns: Sequence[str]) -> Commands:
-    """Add ``--exclude`` to the commands that read the scene at ``path``; others read outputs."""
-    words = "".join(f" --exclude {quoted(pattern)}" for pattern in patterns)
-    start, name = "splatseed ", f" {quoted(path)} "
-    return [
-        (label, line + words * (line.startswith(start) and name in f"{line} "))
-        for label, line in commands
-    ]
-
-
-def show_maps(path: Path, maps: Path) -> tuple[str, str]:
+def show_maps(source: Source, maps: Path) -> tuple[str, str]:
     """Return the command that shows depth maps."""
     picture = quoted(f"{maps.resolve().name}.png")
-    return "look", f"splatseed info {quoted(path)} --depth {quoted(maps)} --picture {picture}"
+    return "look", f"splatseed info {source} --depth {quoted(maps)} --picture {picture}"
 
 
 def number_option(points: int, known: int, limit: int) -> str:
@@ -261,20 +277,20 @@ def number_option(points: int, known: int, limit: int) -> str:
     return f"--ratio {RATIO}" if 0 < RATIO * points <= number else f"--num-points {number}"
 
 
-def lifting_command(path: Path, maps: Path, how: str) -> str:
+def lifting_command(source: Source, maps: Path, how: str) -> str:
     """Return the command that makes seeds from depth maps."""
-    seeds = f"splatseed upsample {quoted(path)} --method depth --depth {quoted(maps)}"
+    seeds = f"splatseed upsample {source} --method depth --depth {quoted(maps)}"
     return f"{seeds} {how} -o OUT"
 
 
-def triangulate_command(path: Path, scene: Scene, output: str) -> str:
+def triangulate_command(source: Source, scene: Scene, output: str) -> str:
     """Return the command that triangulates points for a scene's poses."""
     photographs = scene.source.image_dir
     images = "IMAGES" if photographs is None else quoted(photographs)
-    return f"splatseed sfm {images} --poses-from {quoted(path)} -o {output}"
+    return f"splatseed sfm {images} --poses-from {source} -o {output}"
 
 
-def print_training(read_from: Path, scene: Scene, output: Path, layout: Layout) -> None:
+def print_training(source: Source, scene: Scene, output: Path, layout: Layout) -> None:
     """Print the commands that train a written scene, and what some of them need first."""
     if not scene.images:  # writing it said so
         return
@@ -296,7 +312,7 @@ def print_training(read_from: Path, scene: Scene, output: Path, layout: Layout) 
             print_note(Finding("off-centre-principal-points", text))
     if lenses:
         text = f"{'The other trainers' if known else 'Trainers'} need photographs without lens "
-        text += f"distortion: begin with {undistort_command(read_from)}, and upsample that scene."
+        text += f"distortion: begin with {source.undistortion}, and upsample that scene."
         print_note(Finding("lens-distortion", text, "info"))
 
 

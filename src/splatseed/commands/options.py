@@ -7,10 +7,11 @@ What they name to write is checked and locked before any work is done. All verbs
 from __future__ import annotations
 
 import dataclasses
+import io
 import logging
 import shlex
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, redirect_stderr, suppress
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -49,12 +50,13 @@ def parse_options(
     """
     full = with_reporting(kind)
     given: dict[str, Any] = {} if default is None else {"default": full(**_fields(default))}
-    values = _fields(
-        tyro.cli(
-            full, prog=f"splatseed {verb}", args=list(arguments), config=CONFIG,
-            console_outputs=not quiet, **given,
-        )
-    )  # fmt: skip
+    with _silence() if quiet else nullcontext():
+        values = _fields(
+            tyro.cli(
+                full, prog=f"splatseed {verb}", args=list(arguments), config=CONFIG,
+                console_outputs=not quiet, **given,
+            )
+        )  # fmt: skip
     reporting: Reporting = values.pop(_REPORTING)
     both = reporting.quiet and reporting.verbose
     refuse((both, "--quiet or --verbose", "both", "Leave one of them out."))
@@ -69,6 +71,11 @@ def parse_options(
         if not values.get("dry_run"):
             hold(reserved(path))
     return kind(**values)
+
+
+def _silence() -> AbstractContextManager[object]:
+    """Suppress what tyro prints of values that a class refuses, also without console_outputs."""
+    return redirect_stderr(io.StringIO())
 
 
 def with_reporting(kind: type[Any]) -> type[Any]:
@@ -90,7 +97,7 @@ def parse_some(kind: type[Options], arguments: Sequence[str]) -> Options:
     For options that determine which others there are or their defaults, such as ``--profile``. If
     one is invalid, all have their defaults: ``parse_options`` then reports the error.
     """
-    with suppress(SystemExit):
+    with suppress(SystemExit), _silence():
         return tyro.cli(
             kind, args=list(arguments), config=CONFIG, add_help=False, console_outputs=False,
             return_unknown_args=True,

@@ -39,7 +39,7 @@ from splatseed.requirements import require
 from splatseed.runtime.interruption import exit_code
 from splatseed.scores import TrainingResult
 from splatseed.seeding.budget import in_rho
-from splatseed.settings import fits
+from splatseed.settings import describe_type, fits
 from splatseed.text import did_you_mean, format_duration, quoted, visible
 from splatseed.training.duration import TOO_LONG, RunSpeed, options_for_an_hour, seconds_left
 from splatseed.training.folder import RunFolder
@@ -128,9 +128,9 @@ def _with_options(path: Path, content: Mapping[str, Any]) -> Options:
         given[known[name]][name] = Path(value) if is_path else value
         if not fits(given[known[name]][name], hint):
             raise SceneFormatError(
-                f"a value for {name} in {path} that the option takes",
+                f"{name} = {describe_type(hint)} in {path}",
                 found=repr(value)[:80],
-                fix="Run splatseed train --help.",
+                fix="Correct the file.",
             )
     settings = replace(DEFAULTS, **given[TrainSettings])
     request = TrainRequest(**given[TrainRequest], settings=settings)

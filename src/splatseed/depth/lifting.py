@@ -346,7 +346,7 @@ def _choose(
     usable = int(np.count_nonzero(candidates.tier < SEEN_THROUGH))
     if usable < num:
         more = [] if settings.see_through else ["`depth.see_through=True`"]
-        more += ["a larger `depth.region`"] if settings.region < 1 else []
+        more += ["a larger `depth.central_fraction`"] if settings.central_fraction < 1 else []
         inside = " in the region" if (candidates.tier == OUTSIDE).any() else ""
         seen = "" if settings.see_through else " that no other view sees through"
         allow = f", or allow more with {' or '.join(more)}" if more else ""

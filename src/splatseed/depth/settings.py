@@ -37,8 +37,9 @@ class DepthSettings:
     """Then scale the maps, each by one factor, to agree with each other (paper: no)."""
     unit_ray: bool = False
     """Take z for the distance along the ray, as in equation 9; this bends walls (paper: yes)."""
-    region: Annotated[float, Range(above=0, maximum=1)] = 1.0
-    """Central fraction of the width and of the height that pixels are drawn from (paper: 0.5)."""
+    central_fraction: Annotated[float, Range(above=0, maximum=1)] = 1.0
+    """Draw pixels from this fraction of the width and of the height, around the centre (paper:
+    0.5)."""
     placement: Literal["empty", "uniform"] = "empty"
     """Draw pixels by their distance to the nearest SfM point, or uniformly (paper: uniform)."""
     edge_tolerance: Annotated[float | None, Range(above=0)] = 0.03

@@ -182,7 +182,7 @@ def sample_pixels(
         The pixels' numbers, and whether each lies near a discontinuity; those are drawn last.
     """
     # The central part of each dimension.
-    top, left = (round(0.5 * (1.0 - settings.region) * size) for size in values.shape)
+    top, left = (round(0.5 * (1.0 - settings.central_fraction) * size) for size in values.shape)
     box = (top, left, values.shape[0] - top, values.shape[1] - left)
     step = -(-max(values.shape) // SAMPLING.max_cells)
     weight = np.ones([-(-size // step) for size in values.shape])

@@ -77,6 +77,7 @@ _MAX_PIXELS = 1e9
 """Above all sizes and focal lengths, in pixels."""
 _FOCAL_LENGTHS = {a: frozenset({f"{a}_fov", f"fl_{a}", f"camera_angle_{a}"}) for a in "xy"}
 """Keys of which any states a focal length."""
+_ANY_FOCAL_LENGTH = _FOCAL_LENGTHS["x"] | _FOCAL_LENGTHS["y"]
 _CONVENTION = f"each transform_matrix is world_from_cam, {OPENGL}"
 _BLENDER = ("transforms_train.json", "transforms_test.json")
 _POINT_FILES = ("sparse_pc.ply", "points3d.ply", "points3D.ply", "pointcloud.ply")
@@ -298,7 +299,7 @@ def _merged(shared: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]
             resized |= {f"fl_{axis}": ratio[i] for i, axis in enumerate("xy")}
     replaced = set[str]()
     if stated.keys() & _FOCAL_LENGTHS["x"]:
-        replaced |= _FOCAL_LENGTHS["x"] | _FOCAL_LENGTHS["y"]  # square pixels, unless stated too
+        replaced |= _ANY_FOCAL_LENGTH  # square pixels, unless stated too
     if stated.keys() & _FOCAL_LENGTHS["y"]:
         replaced |= _FOCAL_LENGTHS["y"]
     if stated.keys() & LENS_MODELS:
@@ -332,7 +333,10 @@ def _camera(
         expected = f"a readable image, or w and h to be, in {where}"
         with translate_errors(file, expected, fix=FIX), open_file(file) as opened:
             width, height = open_picture(opened).size
-    if lens_model(values) in _PANORAMAS:  # programs differ in what they write as its focal length
+    bare = not any(values.get(key) is not None for key in (*LENS_MODELS, *_ANY_FOCAL_LENGTH))
+    # Programs differ in what they write as a panorama's focal length; LichtFeld Studio takes what
+    # states none, as Blender's panoramas do, for one.
+    if lens_model(values) in _PANORAMAS or (bare and width == 2 * height):
         model, params = panorama(width, height)
         return model, width, height, params
     fl_x = _focal_length(where, values, "x", width, None)
@@ -347,6 +351,13 @@ def _focal_length(
 ) -> float:
     keys = f"{axis}_fov", f"fl_{axis}", f"camera_angle_{axis}"  # as instant-ngp prefers them
     key = next((key for key in keys if values.get(key) is not None), f"fl_{axis}")
+    if values.get(key) is None and default is None:
+        raise SceneFormatError(
+            f"a focal length (fl_{axis} in pixels, or camera_angle_{axis} in radians) in {where}",
+            found="none",
+            fix="Add it to the file or to each frame; for panoramas, add "
+            '"camera_model": "EQUIRECTANGULAR".',
+        )
     focal_length = _number(where, values, key, default)
     if key != f"fl_{axis}":
         turn, unit = (360, "degrees") if key == f"{axis}_fov" else (2 * math.pi, "radians")

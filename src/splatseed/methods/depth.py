@@ -44,8 +44,8 @@ class Depth(DepthSettings):
         """Return the parameters of the paper's text."""
         return cls(
             fit="least-squares", min_points=1, max_residual_ratio=None, synchronize_scales=False,
-            unit_ray=True, region=0.5, placement="uniform", edge_tolerance=None, min_agreeing=0,
-            see_through=True, color_tolerance=None, spread=False,
+            unit_ray=True, central_fraction=0.5, placement="uniform", edge_tolerance=None,
+            min_agreeing=0, see_through=True, color_tolerance=None, spread=False,
         )  # fmt: skip
 
     def __call__(

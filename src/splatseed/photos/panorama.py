@@ -14,7 +14,7 @@ import math
 import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
-from splatseed.camera import Intrinsics
+from splatseed.camera import FACE_HALF_VIEW, Intrinsics
 from splatseed.frozen import read_only_view
 from splatseed.projection import denormalized, normalized, pixel_centers
 
@@ -27,14 +27,13 @@ FACES: dict[str, Float64[np.ndarray, "3 3"]] = {
     "down": np.array([(1.0, 0, 0), (0, 0, -1), (0, 1, 0)]),
 }
 """Rotation of each face: face_from_panorama."""
-_HALF_VIEW = 50.0  # degrees between a face's axis and the middle of its sides: 5 of them are margin
 _BAND = 256  # rows of a face computed at a time, which bounds the memory of their rays
 
 
 def face_lens(panorama: Intrinsics, camera_id: int = 1) -> Intrinsics:
     """Return the camera of a panorama's faces, PINHOLE and square."""
     focal = panorama.params[0] / (2 * math.pi)  # pixels per radian along the horizon
-    center = max(1, round(focal * math.tan(math.radians(_HALF_VIEW))))
+    center = max(1, round(focal * math.tan(math.radians(FACE_HALF_VIEW))))
     params = (focal, focal, float(center), float(center))
     return Intrinsics(camera_id, "PINHOLE", 2 * center, 2 * center, params)
 

@@ -189,8 +189,8 @@ def find_problems(
         problems.append(Finding("isolated-points", text))
     if cloud.num_points == 0:
         text = (
-            "there are no points yet: splatseed upsample makes some from the photographs, by "
-            "comparing them (method auto), splatseed sfm --poses-from triangulates some"
+            "there are no points yet: make some by comparing the photographs (splatseed upsample), "
+            "or triangulate some (splatseed sfm --poses-from)"
             if scene.has_photographs
             else "there are no points to upsample"
         )

@@ -60,7 +60,7 @@ def upsample(
     num_points: int | None = None,
     budget: int | str | None = None,
     cover: int | None = None,
-    region: str | Region | float | None = None,
+    region: str | Region | None = None,
     extra_method: Upsampler | None = None,
     seed: int = 0,
     profile: Profile = "default",
@@ -92,8 +92,7 @@ def upsample(
         region: Where new points are made: "x0,y0,z0,x1,y1,z1" for a box and others of
             ``parse_region``, or a function from positions [N, 3] to booleans [N]. The originals
             stay everywhere; ``ratio`` multiplies those within, and only new points within fill the
-            budget. Photographs are compared as without it. A number is the parameter of that name
-            of method "depth".
+            budget. Photographs are compared as without it.
         extra_method: A second method, such as ``Cloud().of("scan.laz")``. Its points come before
             those of ``method``, and "auto", "stereo" and "cover" only fill the gaps between them.
         seed: Seed of all random draws; the same seed gives the same bytes on any number of threads.
@@ -130,9 +129,7 @@ def upsample(
     """
     scene = _as_scene(scene)
     check_seed(seed)
-    if isinstance(region, int | float):
-        method = resolve(method, profile, {**parameters, "region": region})[1]
-        region, parameters, profile = None, {}, "default"
+    region = _as_region(region)
     chosen = resolve(method, profile)[1]
     if "test_every" in parameters and isinstance(chosen, PhotographMethod):
         chosen = dataclasses.replace(chosen, test_every=parameters["test_every"])
@@ -221,9 +218,24 @@ def upsample_checked(
     return cloud
 
 
+def _as_region(region: object) -> Region | None:
+    """Parse a region if it is text."""
+    if region is None or callable(region):
+        return region
+    if isinstance(region, str):
+        return parse_region(region)
+    raise ParameterError(
+        "`region` as text, such as 'x0,y0,z0,x1,y1,z1' for a box, or a function of positions",
+        found=repr(region),
+        fix="The central part of photographs, of method depth, is `depth.central_fraction`."
+        if isinstance(region, int | float)
+        else "",
+    )
+
+
 def _usable_region(region: str | Region | None, scene: Scene, method: Upsampler) -> Region | None:
     """Parse a region, and check that a method that needs points alone finds some there."""
-    region = parse_region(region) if isinstance(region, str) else region
+    region = _as_region(region)
     if region is not None and traits_of(method).needs == {"points"}:
         _check_reached(region, scene.points.originals, "points of the scene")
     return region

@@ -34,14 +34,11 @@ from splatseed.io.photograph import (
 )
 from splatseed.photos.panorama import FACES, cut_face, face_directions, face_features, face_lens
 from splatseed.progress import Progress, num_threads
-from splatseed.scene import TEST_EVERY, Image, Masks, Scene, SceneSource, Split
+from splatseed.scene import MIN_HELD_OUT, TEST_EVERY, Image, Masks, Scene, SceneSource, Split
 from splatseed.sfm.cameras import Photos
 from splatseed.text import agreeing, counted, name_some
 from splatseed.tracks import Observations, Tracks
 
-_MIN_TESTED = 4
-"""Fewest panoramas of which every ``TEST_EVERY``-th tests: all faces of one or none, since they
-show a margin of one another."""
 _JPEG_QUALITY = 95
 _MAX_MASKED = 80.0  # degrees from straight down
 _HEAD_BYTES = 1 << 18  # of a file, in which its XMP is
@@ -206,7 +203,7 @@ def find_panoramas(
         raise ParameterError(
             "panoramas of all directions, twice as wide as high, with `panoramas='all'`",
             found=f"{odd[0]} of {width} x {height}",
-            fix="Remove the photographs that are none, or leave `panoramas` out.",
+            fix="Remove the photographs that are not panoramas, or leave `panoramas` out.",
         )
     findings: list[Finding] = []
     stated = dict.fromkeys(wide, True)
@@ -375,12 +372,12 @@ def _moved(tracks: Tracks, moved: Sequence[tuple[int, np.ndarray, np.ndarray]]) 
 
 
 def split_of_faces(names: Mapping[str, Sequence[str]], listed: Split | None = None) -> Split | None:
-    """Return the split of photographs that are cut: all faces of a panorama are in one part.
+    """Return the split of photographs that are cut, as ``Scene.split`` makes it, for a list.
 
-    ``names`` are those of each photograph's faces. Without a list, every ``TEST_EVERY``-th
-    photograph tests; None if there are too few.
+    Trainers that do not recognise faces read the list. ``names`` are those of each photograph's
+    faces. None without a list and with too few photographs.
     """
-    if listed is None and len(names) < _MIN_TESTED:
+    if listed is None and len(names) < MIN_HELD_OUT:
         return None
     test = set(sorted(names)[::TEST_EVERY]) if listed is None else listed.test
     train = names.keys() - test if listed is None else listed.train

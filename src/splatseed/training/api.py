@@ -273,8 +273,11 @@ def _with_default_split(settings: TrainSettings, scene: Scene, note: Note) -> Tr
     chosen = scene.listed is not None or settings.test_every != TrainSettings.test_every
     if chosen or scene.default_test_every == settings.test_every or not scene.images:
         return settings
-    text = f"All {len(scene.images)} photographs are trained on: of fewer than {MIN_HELD_OUT}, "
-    text += "none is held out by default, so nothing is scored on unseen photographs."
+    count = scene.num_viewpoints
+    faces = f", from {count} viewpoints," if count < len(scene.images) else ""
+    text = f"All {len(scene.images)} photographs{faces} are trained on: of fewer than "
+    text += f"{MIN_HELD_OUT}, none is held out by default, so nothing is scored on unseen "
+    text += "photographs."
     fix = f"`test_every={settings.test_every}` holds some out, or list them (docs/formats.md)."
     note(Finding("nothing-held-out", text, "info", fix=fix))
     return dataclasses.replace(settings, test_every=scene.default_test_every)

@@ -161,7 +161,7 @@ def known_depths(
     duration = "" if stereo else f" ({seconds:.0f} s)"
     text = f"Stereo found the depth of {share:.0%} of the pixels{duration}, where strategy "
     text += f"{settings.traits.name} places most new Gaussians."
-    note(Finding("stereo-depths", text, "info", fix='`placing = "none"` only splits.'))
+    note(Finding("stereo-depths", text, "info", fix="With `placing='none'` it only splits them."))
     # Stereo's depths are in units of the scene; unknown ones, NaN, become 0.
     return {
         name: np.nan_to_num(depth * scale)

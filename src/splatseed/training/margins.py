@@ -9,7 +9,6 @@ Gaussians that reach across its edge; the same model gives the same bytes.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -87,15 +86,18 @@ def with_margins(
         values.append(_continued(renderer.color(view), depths[i]))
         progress("margins", 0.5 * (i + 1) / len(small))
     near = [float(np.quantile(d[d > 0], NEAR)) if (d > 0).any() else 0.0 for d in depths]
-    for passes in itertools.count(1):
+    done, left = 0.5, 1  # the share of the work, and passes after this one: at first a guess
+    while True:
         parts = []
         for i in range(len(small)):
             parts.append(_margin(i, small, near, values[i], step))
-            progress("margins", 1 - 0.5 ** (passes + (i + 1) / len(small)))  # of an unknown number
+            progress("margins", done + (1 - done) * (i + 1) / len(small) / (1 + left))
         xyz, colors, sizes = (np.concatenate(each) for each in zip(*parts, strict=True))
         if len(xyz) <= limit:
             break
-        step += max(1, step // 8)
+        done += (1 - done) / (1 + left)
+        left = _passes_left(len(xyz), limit, step)  # one more, as it is an estimate
+        step = _wider(step)
     progress("margins", 1.0)
     if cap is not None and len(model) + len(xyz) > cap:
         order = np.argsort(-model.opacities, kind="stable")[: cap - len(xyz)]
@@ -113,6 +115,18 @@ def with_margins(
         for name, array in model.arrays().items()
     }
     return Gaussians(**grown, antialiased=model.antialiased)
+
+
+def _wider(step: int) -> int:
+    return step + max(1, step // 8)
+
+
+def _passes_left(count: int, limit: float, step: int) -> int:
+    """Estimate how many passes until the limit is met: numbers in rings fall as 1 / step."""
+    wider, passes = step, 0
+    while count * step > limit * wider:
+        wider, passes = _wider(wider), passes + 1
+    return passes
 
 
 def _reduced(view: View, side: float) -> View:

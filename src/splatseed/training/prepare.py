@@ -299,7 +299,7 @@ def _state(
     growing = settings
     if has_margins(settings, views):
         growing = with_room(settings)
-        text = "Beyond the frames of the photographs the model continues what they show."
+        text = "Past the edges of the photographs, the model will continue what they show."
         setup.note(Finding("margins", text, "info"))
     strategy = make_strategy(growing, device, depths, len(depths) / max(1, len(views)))
     checkpoint = setup.folder.checkpoint

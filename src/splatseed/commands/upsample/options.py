@@ -130,6 +130,8 @@ def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
     """Parse the options of the verb and of every method."""
     chosen = parse_some(_Choice, arguments)
     names = dict.fromkeys(METHODS)
+    earlier = any(word.partition("=")[0] == "--depth.region" for word in arguments)
+    refuse((earlier, "--depth.central-fraction", "its earlier name, --depth.region", "Rename it."))
     if chosen.method is not None:
         METHODS[chosen.method]  # raises for an unknown one, with advice
         names[chosen.method] = None

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from splatseed.commands.next_steps import print_training
+from splatseed.commands.next_steps import Source, print_training
 from splatseed.commands.upsample.options import Options
 from splatseed.console import StageClock, add_results, print_note, print_pairs
 from splatseed.depthmap import in_scene_units
@@ -284,7 +284,7 @@ def summarise(
             f"{colmap_command(arguments, output)}"
         )
         print_note(Finding("colmap-layout", text, "info"))
-    print_training(options.scene, scene, output, written.layout)
+    print_training(Source(options.scene, options.exclude), scene, output, written.layout)
 
 
 def write_previews(
