@@ -17,7 +17,7 @@ from splatseed.training.folder import config_of
 from splatseed.training.model_views import find_model_views
 from splatseed.training.parameters import DROPPED, as_parameters, decay_opacities, with_dropout
 from splatseed.training.request import TrainRequest
-from splatseed.training.schedule import make_schedule
+from splatseed.training.schedule import default_steps, make_schedule
 from splatseed.training.traits import STRATEGIES
 
 from ..command_line import exit_code
@@ -136,3 +136,16 @@ def test_photographs_are_held_out_where_the_user_or_the_scene_says_so(room, tmp_
     listed = room.replace(listed=split)
     assert begun(listed, test_every=2, overwrite=True) == ([names[4]], False)
     assert begun(room, overwrite=True) == ([], True)
+
+
+@pytest.mark.parametrize(
+    ("options", "steps"),
+    [({}, 3000), ({"max_steps": 30_000}, 30_000), ({"strategy": "default-3dgs"}, 30_000)],
+)
+def test_few_photographs_get_fewer_steps_by_default(room, tmp_path, options, steps):
+    notes = []
+    request = TrainRequest.of({"strategy": "none", "seeding": "scene", **options})
+    run = prepare_training(room, tmp_path / "run", request, note=notes.append)
+    assert run.settings.max_steps == steps
+    assert ("fewer-steps" in {note.kind for note in notes}) == (steps < 30_000)
+    assert [default_steps(count) for count in (0, 3, 11, 12)] == [30_000, 3000, 3000, 30_000]

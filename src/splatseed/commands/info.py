@@ -56,7 +56,6 @@ from splatseed.seeding.photo_methods import photographed
 from splatseed.text import quoted, visible
 from splatseed.training.folder import RunFolder
 from splatseed.training.request import ExcludeChoice
-from splatseed.training.schedule import FULL_RUN
 
 if TYPE_CHECKING:  # Numba, which takes a while to load, comes with it
     from splatseed.depth.alignment import Alignment
@@ -86,8 +85,9 @@ class Options:
     budget: Annotated[str | None, tyro.conf.arg(metavar="N|Xrho")] = None
     """Gaussians that you plan to end with: a number, or per pixel of a photograph; by default as
     splatseed train's. The advice depends on it."""
-    max_steps: int = FULL_RUN
-    """Steps that you plan to train, for the commands that are printed."""
+    max_steps: int | None = None
+    """Steps that you plan to train, for the commands that are printed; by default as splatseed
+    train's."""
     trainer: Annotated[TrainerName, tyro.conf.arg(name="for")] = "splatseed"
     """The trainer that you plan to use: the advice and the commands are for it."""
     exclude: ExcludeChoice = ()

@@ -25,7 +25,7 @@ from splatseed.seeding.photo_methods import Auto
 from splatseed.text import format_duration, quoted
 from splatseed.training.duration import planned_seconds
 from splatseed.training.request import DEFAULTS
-from splatseed.training.schedule import FULL_RUN
+from splatseed.training.schedule import FULL_RUN, default_steps
 from splatseed.training.settings import BUDGET, TrainSettings
 from splatseed.training.traits import StrategyTraits
 
@@ -86,7 +86,7 @@ class Planned(NamedTuple):
         cls,
         scene: Scene,
         budget: str | None = None,
-        max_steps: int = FULL_RUN,
+        max_steps: int | None = None,
         trainer: TrainerName = "splatseed",
         long_side: int | None = None,
     ) -> Planned:
@@ -107,8 +107,12 @@ class Planned(NamedTuple):
 
             number = max(2, points_within(scene, budget))
             flags = f"--budget {number} "
-        if max_steps != FULL_RUN:
+        if max_steps is not None:
             flags = f"{flags}--max-steps {max_steps} "
+        elif trainer == "splatseed":
+            max_steps = default_steps(len(scene.split(scene.default_test_every)[0]))
+        else:
+            max_steps = FULL_RUN
         strategy = DEFAULTS.strategy if trainer == "splatseed" else "default"
         settings = TrainSettings(strategy=strategy, max_steps=max_steps, cap_max=number)
         max_seeds = settings.max_seeds(number)

@@ -34,9 +34,11 @@ from splatseed.scene import MIN_HELD_OUT, Image, Scene
 from splatseed.scores import EvalResult
 from splatseed.seeding.budget import in_rho, median_pixels, median_size, parse_budget
 from splatseed.settings import change_settings
+from splatseed.text import agreeing, counted
 from splatseed.training.config import excluded_names, near_plane_of
 from splatseed.training.folder import RunFolder, config_of, model_file
 from splatseed.training.request import EvaluateRequest, TrainRequest
+from splatseed.training.schedule import default_steps
 from splatseed.training.settings import BUDGET, MIN_GAUSSIANS, TrainSettings
 from splatseed.training.traits import AUTO
 
@@ -189,6 +191,8 @@ def prepare_training(
         note(scene.listed.finding(given="test_every" in request.named))
     if resumed is None and "test_every" not in request.named:
         settings = _with_default_split(settings, scene, note)
+    if resumed is None and "max_steps" not in request.named:
+        settings = _with_default_steps(settings, scene, note)
     settings = _sized(settings, scene, request.long_side, resumed, note)
     settings = _within_budget(settings, request.budget, scene, note)
     adds_points = settings.region is not None or settings.seeding == "auto"
@@ -281,6 +285,19 @@ def _with_default_split(settings: TrainSettings, scene: Scene, note: Note) -> Tr
     fix = f"`test_every={settings.test_every}` holds some out, or list them (docs/formats.md)."
     note(Finding("nothing-held-out", text, "info", fix=fix))
     return dataclasses.replace(settings, test_every=scene.default_test_every)
+
+
+def _with_default_steps(settings: TrainSettings, scene: Scene, note: Note) -> TrainSettings:
+    """The settings, with fewer steps for few photographs, unless they are to be 3DGS's."""
+    count = len(scene.split(settings.test_every)[0])
+    steps = default_steps(count)
+    if steps == settings.max_steps or settings.as_3dgs:
+        return settings
+    text = f"{counted(count, 'photograph')} {agreeing(count, 'is', 'are')} trained on for "
+    text += f"{steps:,} steps: more would fit them better, but not other views."
+    fix = f"`max_steps={settings.max_steps}` takes more."
+    note(Finding("fewer-steps", text, "info", fix=fix))
+    return dataclasses.replace(settings, max_steps=steps)
 
 
 def _sized(

@@ -59,7 +59,8 @@ class TrainSettings:
     which scored best; mcmc: as MCMC does, up to a budget; strategy default: as 3DGS does; none: not
     at all; -3dgs: 3DGS's own rates, sizes and schedules, to compare with published numbers."""
     max_steps: Annotated[int, Range(1)] = FULL_RUN
-    """Training steps; schedules and learning rates adapt to them."""
+    """Training steps; schedules and learning rates adapt to them. With fewer than 12 photographs
+    to train on, train takes 3000 by default."""
     data_factor: Annotated[int | float | None, Range(1)] = None
     """Divide the width and height of the photographs by this number; by default by the smallest
     whole one that leaves at most 1600 pixels on their longer side."""
