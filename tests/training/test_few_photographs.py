@@ -140,7 +140,7 @@ def test_photographs_are_held_out_where_the_user_or_the_scene_says_so(room, tmp_
 
 @pytest.mark.parametrize(
     ("options", "steps"),
-    [({}, 3000), ({"max_steps": 30_000}, 30_000), ({"strategy": "default-3dgs"}, 30_000)],
+    [({}, 1500), ({"max_steps": 30_000}, 30_000), ({"strategy": "default-3dgs"}, 30_000)],
 )
 def test_few_photographs_get_fewer_steps_by_default(room, tmp_path, options, steps):
     notes = []
@@ -148,4 +148,4 @@ def test_few_photographs_get_fewer_steps_by_default(room, tmp_path, options, ste
     run = prepare_training(room, tmp_path / "run", request, note=notes.append)
     assert run.settings.max_steps == steps
     assert ("fewer-steps" in {note.kind for note in notes}) == (steps < 30_000)
-    assert [default_steps(count) for count in (0, 3, 11, 12)] == [30_000, 3000, 3000, 30_000]
+    assert [default_steps(count) for count in (0, 3, 11, 12)] == [30_000, 1500, 1500, 30_000]

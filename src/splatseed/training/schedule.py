@@ -19,9 +19,9 @@ from splatseed.training.traits import StrategyTraits
 
 FULL_RUN = 30_000
 
-FEW_STEPS, MAX_SHORT = 3_000, 11
-"""Default steps of ``train`` with at most that many training photographs, which more steps fit
-better, but not other views: of 3 of dorm 1,500 and 7,000 steps are level."""
+FEW_STEPS, MAX_SHORT = 1_500, 11
+"""Default steps of ``train``, and with how many training photographs at most: more fit these
+better, but not other views."""
 
 LEARNING_RATES: Mapping[str, float] = MappingProxyType(
     {

@@ -60,7 +60,7 @@ class TrainSettings:
     at all; -3dgs: 3DGS's own rates, sizes and schedules, to compare with published numbers."""
     max_steps: Annotated[int, Range(1)] = FULL_RUN
     """Training steps; schedules and learning rates adapt to them. With fewer than 12 photographs
-    to train on, train takes 3000 by default."""
+    to train on, train takes 1500 by default."""
     data_factor: Annotated[int | float | None, Range(1)] = None
     """Divide the width and height of the photographs by this number; by default by the smallest
     whole one that leaves at most 1600 pixels on their longer side."""
