@@ -19,8 +19,9 @@ from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.findings import Finding
 from splatseed.io.files import absolute, open_file, similar_name, special_kind, translate_errors
 from splatseed.io.photograph import COPY_AGAIN, photograph_bytes, photograph_folder
-from splatseed.io.picture import ORIENTATION, open_picture
+from splatseed.io.picture import ORIENTATION, UPRIGHT, open_picture
 from splatseed.io.recordings import is_extracted
+from splatseed.io.staging import read_manifest
 from splatseed.scene import Image, Scene
 from splatseed.text import agreeing, counted, name_some
 
@@ -38,6 +39,8 @@ MIN_FOCAL = 0.05
 """Smallest plausible focal length of a perspective camera, in image sizes: 169 degrees."""
 _SIDEWAYS = frozenset({5, 6, 7, 8})
 """EXIF orientations that swap width and height."""
+ORIENTATIONS = "orientations"
+"""Manifest entry: by name, EXIF orientations of photographs whose copies are marked as upright."""
 _NAMED = 3  # photographs listed in a message
 
 
@@ -137,6 +140,15 @@ def exif_orientation(path: Path) -> int:
             return int(picture.getexif().get(ORIENTATION, 0))
     except Exception:  # noqa: BLE001  (damaged EXIF makes Pillow raise anything)
         return 0
+
+
+def original_orientation(image: Image) -> int:
+    """Return the EXIF orientation of a photograph, or of the one that ``sfm`` copied upright."""
+    found = exif_orientation(image.path)
+    if found > UPRIGHT or image.folder is None:
+        return found
+    recorded = read_manifest(image.folder.resolve().parent).get(ORIENTATIONS)
+    return recorded.get(image.name, found) if isinstance(recorded, dict) else found
 
 
 def photograph_findings(
