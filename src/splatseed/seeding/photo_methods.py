@@ -421,7 +421,7 @@ def _confirmed_share(scene: Scene, stereo: StereoResult, seconds: float) -> tupl
     """Report the share of pixels with depth, and the time, if points could not guide stereo."""
     if has_depth_hints(scene):
         return ()
-    points = "too few" if has_points(scene) else "no"
+    points = "too few" if len(scene.points) else "no"
     share = np.mean([stereo.confirmed(i).mean() for i in range(len(stereo.views))])
     text = (
         f"With {points} points to start from, stereo gave {share:.0%} of the photographs' pixels a "
