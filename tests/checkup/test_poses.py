@@ -99,6 +99,12 @@ def test_only_poses_of_scenes_without_points_are_checked(room, poses, monkeypatc
     seeds = upsample(_posed(room, poses), note=notes.append)
     assert len(seeds) > 300
     assert [note.kind for note in notes] == ["confirmed-depth", "few-photographs"]
+    turned = poses.copy()
+    turned[4] = np.diag([-1.0, -1, 1, 1]) @ poses[4]  # as if the photograph were upside down
+    notes.clear()
+    upsample(_posed(room, turned), note=notes.append)
+    (odd,) = [note for note in notes if note.kind == "photographs-disagree"]
+    assert odd.subjects == (room.images[4].name,)
     monkeypatch.setattr(module, "check_poses", None)
     upsample(room, "stereo")
     with pytest.raises(SceneNotFoundError, match=r"other than test views.*all 1 are test views"):

@@ -10,7 +10,7 @@ import pytest
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import colmap, load_scene, write_scene
-from splatseed.io.photograph_checks import with_photographs
+from splatseed.io.photograph_checks import photograph_findings, with_photographs
 from splatseed.photos.visibility import find_visibility
 
 from ..findings import texts
@@ -52,6 +52,17 @@ def test_missing_photographs_leave_the_others_in_their_part(scene_dir):
         SceneNotFoundError, match=r"at least half of the scene's 4 .* found 1; missing"
     ):
         with_photographs(scene)
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_a_photograph_in_another_folder_is_named(scene_dir, named):
+    images = list(load_scene(scene_dir).images)
+    (scene_dir / "images" / "left").rename(scene_dir / "images" / "cam0")
+    if named:  # then these files are other images'
+        images += [replace(each, name=each.name.replace("left", "cam0")) for each in images]
+    found = photograph_findings(images, scene_dir / "images", scene_dir)[0]
+    hint = "cam0/image000.jpg exists, but names must match exactly"
+    assert (hint in found.text) is not named
 
 
 @pytest.mark.parametrize("form", ["bin", "txt"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -81,6 +82,15 @@ def test_exif_decides_before_poses(tmp_path):
         exif[ORIENTATION] = (6, 1, 8, 3)[i % 4]
         PilImage.new("RGB", (12, 9)).save(image.path, exif=exif)
     assert quarter_turns(images) == [1, 0, 3, 2] * 3
+    recorded = {image.name: (6, 1, 8, 3)[i % 4] for i, image in enumerate(images)}
+    copies = tmp_path / "scene" / "images"
+    copies.mkdir(parents=True)
+    for image in images:  # as sfm copies them: EXIF says upright, the manifest what it said
+        PilImage.new("RGB", (12, 9)).save(copies / image.name)
+    (tmp_path / "linked").symlink_to(copies)  # as in an output of upsample
+    (tmp_path / "scene" / "splatseed.json").write_text(json.dumps({"orientations": recorded}))
+    copied = [dataclasses.replace(image, folder=tmp_path / "linked") for image in images]
+    assert quarter_turns(copied) == [1, 0, 3, 2] * 3
     tall = dataclasses.replace(images[0].intrinsics, width=90, height=120)
     images = [dataclasses.replace(image, intrinsics=tall) for image in images]
     assert quarter_turns(images) == [0] * 12  # a tag that was kept beside turned pixels

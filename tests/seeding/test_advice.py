@@ -60,7 +60,10 @@ def test_one_photograph_is_too_few_and_none_is_needed_to_test():
         Image(f"{i}.png", i, lens, np.array([1.0, 0, 0, 0]), np.zeros(3)) for i in (1, 2)
     )
     assert untrainable(Scene(PointCloud.empty(), images[:1])).text.endswith("two photographs.")
-    assert "two photographs" not in untrainable(Scene(PointCloud.empty(), images)).text
+    two = Scene(PointCloud.empty(), images)
+    assert "two photographs" not in untrainable(two).text
+    left = Scene(PointCloud.empty(), (*images, replace(images[0], name="0.png"))).without(["0.png"])
+    assert untrainable(left).text == untrainable(two).text  # the copy was the test photograph
 
 
 ANGLES = np.linspace(0, 2 * np.pi, 8, endpoint=False)

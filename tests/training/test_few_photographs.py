@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from splatseed.scene import Split
+from splatseed.splat.evaluate import evaluate_views
 from splatseed.splat.formats import read_gaussians
 from splatseed.splat.render_loss import RenderLoss
 from splatseed.training import schedule
@@ -83,6 +84,14 @@ def test_only_runs_with_few_photographs_are_changed(begin, monkeypatch, few, dif
         return run.state.params["means"].detach()
 
     assert torch.equal(trained("plain", 0), trained("few", few)) is not differs
+
+
+def test_without_test_views_the_curve_ends_with_the_gaussians_written(begin):
+    run = begin(strategy="grow", max_steps=3, test_every=0)
+    run.train()
+    written = run.finish(evaluate_views).scores.num_gaussians
+    before, end = run.folder.curve_csv.read_text().splitlines()[-2:]
+    assert int(end.split(",")[5]) == written > int(before.split(",")[5])  # margins
 
 
 @pytest.mark.usefixtures("draw_curves")

@@ -10,7 +10,7 @@ from splatseed.camera import Intrinsics
 from splatseed.commands.capture_check import PoseCheck
 from splatseed.commands.next_steps import Planned
 from splatseed.io.load import depths_beside
-from splatseed.scene import Scene
+from splatseed.scene import Image, Scene
 from splatseed.seeding import diagnostics
 from splatseed.seeding.advice import Advice
 from splatseed.seeding.photo_methods import Auto
@@ -22,7 +22,7 @@ KINDS_SHOWN = 3
 
 def scene_facts(scene: Scene) -> dict[str, Any]:
     """Return the source and the contents of a scene, for ``--json``."""
-    train, test = scene.split(scene.default_test_every)
+    train, test = _parts(scene)
     return {
         "format": scene.source.format,
         "root": str(scene.source.root),
@@ -40,6 +40,13 @@ def scene_facts(scene: Scene) -> dict[str, Any]:
     }
 
 
+def _parts(scene: Scene) -> list[list[Image]]:
+    """Return the images to train on and to test; if any has a photograph, those that have one."""
+    some = any(image.has_photograph for image in scene.images)
+    parts = scene.split(scene.default_test_every)
+    return [[image for image in part if image.has_photograph or not some] for part in parts]
+
+
 def _cameras(scene: Scene) -> list[Intrinsics]:
     """Return all cameras, in pixels of their photographs, in the order of their records."""
     used: dict[int, dict[Intrinsics, None]] = {}
@@ -54,7 +61,7 @@ def source_rows(scene: Scene) -> list[tuple[str, str]]:
     cameras = [f"{count:,} {kind}" for kind, count in sizes.most_common(KINDS_SHOWN)]
     if len(sizes) > KINDS_SHOWN:
         cameras.append(f"{len(sizes) - KINDS_SHOWN:,} more kinds")
-    train, test = scene.split(scene.default_test_every)
+    train, test = _parts(scene)
     by = f", by its {scene.listed.origin}" if scene.listed else ""
     images = f"{len(scene.images):,} ({len(train):,} to train, {len(test):,} to test{by})"
     rows = [

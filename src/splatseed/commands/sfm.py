@@ -36,7 +36,7 @@ from splatseed.sfm import MatcherName, Settings, SfmReport, reconstruct
 from splatseed.sfm.first_look import FIRST_LOOK, NEIGHBOURS, STAGE
 from splatseed.sfm.panoramas import PanoramasName
 from splatseed.sfm.photos import pick_frames
-from splatseed.text import counted, name_some, quoted, visible
+from splatseed.text import agreeing, counted, name_some, quoted, visible
 from splatseed.training.request import ExcludeChoice
 
 if TYPE_CHECKING:  # Numba, for which --help would wait, comes with it
@@ -291,6 +291,10 @@ def _summarise(options: Options, report: SfmReport, error: PoseErrorEstimate | N
         print_note(Finding("inexact-poses", text))
     print_note(*report.findings)
     if report.unregistered:
-        text = f"without a pose: {name_some(report.unregistered)}"
-        print_note(Finding("unregistered-images", text, subjects=tuple(report.unregistered)))
+        lost = len(report.unregistered)
+        are = agreeing(lost, "has no pose and is", "have no pose and are")
+        text = f"{counted(lost, 'photograph')} {are} left out: {name_some(report.unregistered)}."
+        shares = agreeing(lost, "It shares", "They share")
+        fix = f"{shares} too little with the others: take more photographs in between."
+        print_note(Finding("unregistered-images", text, subjects=report.unregistered, fix=fix))
     print_next([("what suits it", f"splatseed info {quoted(options.output)}")])

@@ -122,11 +122,20 @@ def rigid_pose(
     with np.errstate(over="ignore", invalid="ignore"):  # huge numbers fail the check below
         off = np.abs(rotation @ rotation.T - np.eye(3)).max()
         proper = np.linalg.det(rotation) > 0
+        scale = np.linalg.norm(rotation, axis=1)
+        uniform = np.ptp(scale) <= _RIGID_TOLERANCE * scale.max()
     affine = np.allclose(world_from_cam[3:], [[0, 0, 0, 1]], atol=_RIGID_TOLERANCE)
     if not (off <= _RIGID_TOLERANCE and proper and affine):
         expected = f"a rotation and a translation as world_from_cam in {where}"
-        fix = "Remove the scale from the poses (and from the points)."
-        raise SceneFormatError(expected, found="a scaled, sheared or mirrored one", fix=fix)
+        found, fix = "a sheared one", "Correct the file, or export the scene again."
+        if not affine:
+            row = ", ".join(f"{value:g}" for value in world_from_cam[3])
+            found = f"{row} as its last row instead of 0, 0, 0, 1"
+        elif not proper:
+            found, fix = "a mirrored one", f"An axis or its sign is wrong. {fix}"
+        elif uniform and abs(scale[0] - 1) > _RIGID_TOLERANCE / 4:
+            found, fix = f"one scaled by {scale[0]:.4g}", "Divide its 3 x 3 part by that."
+        raise SceneFormatError(expected, found=found, fix=fix)
     quat = quat_from_rotation(rotation)
     if off > _EXACT:  # else the centre would move: by a metre, for six digits at a million
         rotation = rotation_from_quat(quat)

@@ -23,7 +23,7 @@ from splatseed.findings import Finding
 from splatseed.io.depth_files import SUFFIXES as DEPTH_SUFFIXES
 from splatseed.io.depth_maps import DepthFiles, find_confidences
 from splatseed.io.files import IMAGE_SUFFIXES, absolute, read_json
-from splatseed.text import counted
+from splatseed.text import agreeing, counted
 
 _PHOTOGRAPHS = ("images", "image", "input", "rgb", "images_2", "images_4", "images_8")
 _SCANNETPP = ("../resized_images", "../resized_undistorted_images")
@@ -221,7 +221,8 @@ def _moved(path: Path, listed: Sequence[_Listed]) -> list[Finding]:
     if not moved:
         return []
     name, file = next(iter(moved.items()))
-    what = f"{counted(len(moved), 'frame')} of {path.name} name missing photographs"
+    names = agreeing(len(moved), "names a missing photograph", "name missing photographs")
+    what = f"{counted(len(moved), 'frame')} of {path.name} {names}"
     text = f"{what}; files of the same name are read instead, such as {file} for {name}."
     return [Finding("moved-photographs", text, subjects=tuple(moved))]
 

@@ -63,7 +63,7 @@ from splatseed.io.point_files import differing_points
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import OPENGL, Image, Masks, Scene, SceneSource, Split
 from splatseed.similarity import fit_similarity
-from splatseed.text import counted
+from splatseed.text import agreeing, counted
 
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -247,7 +247,8 @@ def read_transforms(path: Path) -> Transforms:
         text = f"k4 of {odd} frames is ignored: COLMAP's perspective models have no such term."
         findings.append(Finding("ignored-distortion", text))
     if repeated:
-        text = f"{counted(repeated, 'frame')} of {path.name} are duplicates and left out."
+        repeats = agreeing(repeated, "repeats another and is", "repeat others and are")
+        text = f"{counted(repeated, 'frame')} of {path.name} {repeats} left out."
         findings.append(Finding("duplicate-frames", text))
     findings += unusable_findings(unusable, len(images))
     return Transforms(

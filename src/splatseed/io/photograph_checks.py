@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from PIL import Image as PilImage
@@ -19,8 +19,9 @@ from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.findings import Finding
 from splatseed.io.files import absolute, open_file, similar_name, special_kind, translate_errors
 from splatseed.io.photograph import COPY_AGAIN, photograph_bytes, photograph_folder
-from splatseed.io.picture import ORIENTATION, open_picture
+from splatseed.io.picture import ORIENTATION, UPRIGHT, open_picture
 from splatseed.io.recordings import is_extracted
+from splatseed.io.staging import read_manifest
 from splatseed.scene import Image, Scene
 from splatseed.text import agreeing, counted, name_some
 
@@ -38,6 +39,8 @@ MIN_FOCAL = 0.05
 """Smallest plausible focal length of a perspective camera, in image sizes: 169 degrees."""
 _SIDEWAYS = frozenset({5, 6, 7, 8})
 """EXIF orientations that swap width and height."""
+ORIENTATIONS = "orientations"
+"""Manifest entry: by name, EXIF orientations of photographs whose copies are marked as upright."""
 _NAMED = 3  # photographs listed in a message
 
 
@@ -55,7 +58,7 @@ def with_photographs(scene: Scene) -> Scene:
         raise SceneNotFoundError(
             f"at least half of the scene's {len(scene.images)} photographs in {folder}",
             found=f"{len(scene.images) - len(missing) or 'none'}; "
-            f"missing: {name_some(missing, _NAMED)}",
+            f"missing: {name_some(missing, _NAMED)}{_hint(missing[0], folder, scene.images)}",
             fix="Copy them there, with the names of the model.",
         )
     return scene.without(missing)
@@ -139,6 +142,15 @@ def exif_orientation(path: Path) -> int:
         return 0
 
 
+def original_orientation(image: Image) -> int:
+    """Return the EXIF orientation of a photograph, or of the one that ``sfm`` copied upright."""
+    found = exif_orientation(image.path)
+    if found > UPRIGHT or image.folder is None:
+        return found
+    recorded = read_manifest(image.folder.resolve().parent).get(ORIENTATIONS)
+    return recorded.get(image.name, found) if isinstance(recorded, dict) else found
+
+
 def photograph_findings(
     images: Sequence[Image], image_dir: Path | None, root: Path
 ) -> list[Finding]:
@@ -155,7 +167,7 @@ def photograph_findings(
         return [Finding("missing-photographs", text), *odd]
     images = [replace(image, folder=image_dir) for image in images]
     absent = {im.name: None for im in images if not im.has_photograph}
-    findings = [_missing([*absent], len(images), image_dir)] if absent else []
+    findings = [_missing([*absent], images, image_dir)] if absent else []
     # Links are not followed: users make them on purpose.
     around = absolute(root)
     outside = [im.name for im in images if around not in absolute(im.path).parents]
@@ -196,15 +208,23 @@ def _is_of_another_size(lens: Intrinsics) -> bool:
     return bool(off > MAX_OFF_CENTER or too_wide)
 
 
-def _missing(missing: Sequence[str], count: int, image_dir: Path) -> Finding:
-    first, are = missing[0], agreeing(len(missing), "is", "are")
+def _missing(missing: Sequence[str], images: Sequence[Image], image_dir: Path) -> Finding:
+    are = agreeing(len(missing), "is", "are")
+    subject = f"{len(missing)} of {len(images)} images {are} missing in {image_dir}, and left out"
+    text = f"{subject} ({name_some(missing, _NAMED)}){_hint(missing[0], image_dir, images)}."
+    return Finding("missing-photographs", text, subjects=tuple(missing))
+
+
+def _hint(first: str, image_dir: Path, images: Sequence[Image]) -> str:
+    """Explain why a photograph is missing: one of another suffix, case or folder may exist."""
     near, kind = similar_name(image_dir / first), special_kind(image_dir / first)
+    if near is None:
+        alike = [p for p in image_dir.rglob("*") if p.name == PurePosixPath(first).name]
+        names = {path.relative_to(image_dir).as_posix() for path in alike}
+        near = min(names - {image.name for image in images}, default=None)
     hint = f"; {near} exists, but names must match exactly" if near else ""
     hint = f"; {first} is {kind}" if kind else hint
-    hint = "; separate folders by /, not by \\" if "\\" in first else hint
-    subject = f"{len(missing)} of {count} images {are} missing in {image_dir}, and left out"
-    text = f"{subject} ({name_some(missing, _NAMED)}){hint}."
-    return Finding("missing-photographs", text, subjects=tuple(missing))
+    return "; separate folders by /, not by \\" if "\\" in first else hint
 
 
 def _size_findings(images: Sequence[Image]) -> list[Finding]:

@@ -68,8 +68,10 @@ def load_split(
         parts = ", one to train on and one to test" if tests else ""
         raise SceneNotFoundError(
             f"at least two images with a pose{parts}",
-            found=f"{len(scene.images)}",
-            fix="Name a scene with more photographs.",
+            found=f"{len(train)} to train on, {len(test)} to test" if tests else f"{len(train)}",
+            fix="Name a scene with more photographs, or choose another `test_every`."
+            if tests and scene.listed is None
+            else "Name a scene with more photographs.",
         )
     views = load_views(
         scene, (*train, *test), data_factor=data_factor, min_side=min_side, cache_dir=cache_dir,

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.camera import Camera
-from splatseed.io.photograph_checks import exif_orientation
+from splatseed.io.photograph_checks import original_orientation
 from splatseed.scene import Image, Scene
 
 _EXIF_TURNS = {6: 1, 3: 2, 8: 3}
@@ -94,4 +94,4 @@ def vertical(scene: Scene | None, cameras: Sequence[Camera]) -> Float64[np.ndarr
 def _exif_turn(image: Image) -> int:
     if image.folder is None or image.lens.width <= image.lens.height:
         return 0  # sensors are wide: a tall photograph was turned, though its EXIF may still say so
-    return _EXIF_TURNS.get(exif_orientation(image.path), 0)
+    return _EXIF_TURNS.get(original_orientation(image), 0)

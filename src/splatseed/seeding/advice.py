@@ -139,7 +139,7 @@ def advise(
     if why_no_seeds and (measured.empty is None or measured.empty < MAX_BARE):
         covered = f"{bare}. {why_no_seeds}" if bare else why_no_seeds
         return Advice(AS_IT_IS, (f"It has {per_pixel}.", covered), measured)
-    reasons = [f"It has {per_pixel}, and room for {has:.1f} times as many seeds."]
+    reasons = [f"It has {per_pixel}, and room for {has:,.1f} times as many seeds."]
     if measured.metric_maps:
         reasons.append("Where photographs confirm no depth, it is that of the depth maps.")
     elif measured.depth_maps:
@@ -197,7 +197,7 @@ def untrainable(scene: Scene) -> Finding | None:
 def _why_untrainable(scene: Scene) -> str:
     if not scene.images:
         return "Points alone cannot be trained: training needs photographs and cameras."
-    if not all(scene.split()):
+    if not all(scene.split()) if scene.listed else len(scene.images) < 2:
         listed = "photographs to train on and to test in its lists"
         return f"Training needs {listed if scene.listed else 'at least two photographs'}."
     folder = scene.source.image_dir

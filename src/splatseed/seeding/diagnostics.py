@@ -22,6 +22,7 @@ from splatseed.photos.visibility import points_in_image
 from splatseed.progress import Progress, silent
 from splatseed.sampling import strided
 from splatseed.scene import Image, Scene
+from splatseed.text import agreeing, counted
 from splatseed.tracks import NO_POINT
 
 EMPTY_CELLS = 32  # cells of the grid of empty regions along an image's longer side
@@ -183,7 +184,8 @@ def find_problems(
     added = scene.points.num_original < len(scene.points)  # nothing will be interpolated
     if not added and cloud.isolated > MAX_ISOLATED * max(used, 1):
         text = (
-            f"{cloud.isolated:,} points ({cloud.isolated / used:.1%}) are isolated: "
+            f"{counted(cloud.isolated, 'point')} ({cloud.isolated / used:.1%}) "
+            f"{agreeing(cloud.isolated, 'is', 'are')} isolated: "
             "outliers or a sparse background; methods that interpolate never start from them"
         )
         problems.append(Finding("isolated-points", text))

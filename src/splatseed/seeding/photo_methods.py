@@ -35,7 +35,7 @@ from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Note, Progress, StageTimes, silent_note, watched
 from splatseed.scene import Image, Scene
 from splatseed.settings import Range, check_settings
-from splatseed.text import counted
+from splatseed.text import agreeing, counted, name_some
 
 if TYPE_CHECKING:
     from splatseed.depth.stereo.maps import StereoMap, StereoResult
@@ -44,6 +44,10 @@ MAX_SIZE = 800
 """Longer side, in pixels, of the photographs that methods compare."""
 CELL = 8
 """Side, in pixels, of the cells in which cover looks for points."""
+MAX_ODD_SHARE, MIN_MEDIAN_SHARE = 0.1, 0.2
+"""Of a photograph's confirmed pixels, as a fraction of the median over photographs, up to which it
+does not fit; and of this median. Of another place or pose it is 0.06, in twelve captures 0.2 or
+more, or the median is lower."""
 
 
 @dataclass(frozen=True)
@@ -418,16 +422,37 @@ def _cover(
 
 
 def _confirmed_share(scene: Scene, stereo: StereoResult, seconds: float) -> tuple[Finding, ...]:
-    """Report the share of pixels with depth, and the time, if points could not guide stereo."""
+    """Report the share of pixels with depth, and the time, if points could not guide stereo.
+
+    Photographs that others hardly confirm are named: no points have checked their poses.
+    """
     if has_depth_hints(scene):
         return ()
-    points = "too few" if has_points(scene) else "no"
-    share = np.mean([stereo.confirmed(i).mean() for i in range(len(stereo.views))])
+    points = "too few" if len(scene.points) else "no"
+    shares = [float(stereo.confirmed(i).mean()) for i in range(len(stereo.views))]
     text = (
-        f"With {points} points to start from, stereo gave {share:.0%} of the photographs' pixels a "
-        f"confirmed depth, in {seconds:.0f} s."
+        f"With {points} points to start from, stereo gave {np.mean(shares):.0%} of the "
+        f"photographs' pixels a confirmed depth, in {seconds:.0f} s."
     )
-    return (Finding("confirmed-depth", text, "info"),)
+    found = Finding("confirmed-depth", text, "info")
+    median = float(np.median(shares))
+    odd = tuple(
+        view.name
+        for view, share in zip(stereo.views, shares, strict=True)
+        if share <= MAX_ODD_SHARE * median and view.surface is None  # masked pixels confirm nothing
+    )
+    if not odd or median < MIN_MEDIAN_SHARE:
+        return (found,)
+    does, its, pose, it = agreeing(
+        len(odd), "does,its,pose is,it shows", "do,their,poses are,they show"
+    ).split(",")
+    text = (
+        f"{counted(len(odd), 'photograph')} {does} not fit the others, which confirm almost none "
+        f"of {its} depth ({median:.0%} in the median photograph): {name_some(odd)}; {its} "
+        f"{pose} wrong, or {it} other things."
+    )
+    fix = "`exclude` leaves such photographs out."
+    return found, Finding("photographs-disagree", text, subjects=odd, fix=fix)
 
 
 def _check_given_poses(

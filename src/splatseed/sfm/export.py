@@ -12,7 +12,9 @@ from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import OutputError
+from splatseed.io.photograph_checks import ORIENTATIONS
 from splatseed.io.picture import ORIENTATION, UPRIGHT
+from splatseed.io.staging import MANIFEST, write_json
 from splatseed.pointcloud import first_of_equals
 from splatseed.sfm.colmap import ColmapRun
 from splatseed.sfm.photos import copy_misread
@@ -26,10 +28,10 @@ _NEGLIGIBLE = 2e-7  # a coefficient that counts as distortion but moves no pixel
 def export_scene(run: ColmapRun, model_dir: Path, staging: Path, *, distinct: bool = True) -> None:
     """Write a model's undistorted photographs and points to ``staging``.
 
-    Photographs of PINHOLE cameras are copied, with the EXIF orientation cleared; of the others,
-    transparent pixels are black. Reprojection errors are in pixels of the undistorted photographs.
-    ``distinct`` drops points at the position of another, and those that undistorted features
-    contradict.
+    Photographs of PINHOLE cameras are copied; of the others, transparent pixels are black. EXIF
+    orientations are moved to the manifest. Reprojection errors are in pixels of the undistorted
+    photographs. ``distinct`` drops points at the position of another, and those that undistorted
+    features contradict.
     """
     pycolmap, dense, straight = run.pycolmap, run.work / "dense", run.work / "straight"
     given = pycolmap.Reconstruction(model_dir)
@@ -69,7 +71,8 @@ def export_scene(run: ColmapRun, model_dir: Path, staging: Path, *, distinct: bo
     (staging / "sparse").mkdir()
     (dense / "sparse").rename(staging / "sparse" / "0")
     (dense / "images").rename(staging / "images")
-    clear_orientation(staging / "images")
+    if cleared := clear_orientation(staging / "images"):
+        write_json(staging / MANIFEST, {ORIENTATIONS: cleared})
     model = pycolmap.Reconstruction(staging / "sparse" / "0")
     if distinct:
         drop_folded(model)
@@ -131,13 +134,14 @@ def drop_repeats(model: Any) -> None:
         model.delete_point3D(repeat)
 
 
-def clear_orientation(folder: Path) -> None:
-    """Set the orientation of all JPEG and TIFF files in a folder to upright.
+def clear_orientation(folder: Path) -> dict[str, int]:
+    """Set the orientation of all JPEG and TIFF files in a folder to upright; return those it had.
 
     COLMAP uses stored pixels but copies the tag; a trainer whose image reader applies it (OpenCV
     does, and Pillow for TIFF) would rotate the photograph relative to its camera. Only the tag's
     two bytes change.
     """
+    cleared: dict[str, int] = {}
     for path in folder.rglob("*"):
         if path.suffix.lower() not in {".jpg", ".jpeg", ".tif", ".tiff"}:
             continue
@@ -155,7 +159,9 @@ def clear_orientation(folder: Path) -> None:
                 upright = struct.pack(order, ORIENTATION, _SHORT, 1, UPRIGHT)
                 path.unlink()  # copies of read-only photographs are read-only
                 path.write_bytes(content[:at] + upright + content[at + len(upright) :])
+                cleared[path.relative_to(folder).as_posix()] = orientation
                 break
+    return cleared
 
 
 def _first_directory(content: bytes) -> int:

@@ -27,7 +27,7 @@ from splatseed.io.photograph import photograph_folder
 from splatseed.io.photograph_checks import check_sizes, with_photographs
 from splatseed.io.picture import find_white
 from splatseed.io.seeds import carry_seeds
-from splatseed.io.staging import MANIFEST, output_folder, write_json
+from splatseed.io.staging import MANIFEST, output_folder, read_manifest, write_json
 from splatseed.photos.sizes import at_file_size
 from splatseed.progress import Note, Progress, silent, silent_note
 from splatseed.requirements import require, version_of
@@ -223,6 +223,7 @@ def reconstruct(
             write_split(poses_from, staging)
             write_offset(staging, poses_from.offset)
         manifest = {
+            **read_manifest(staging),
             "job": "reconstruct" if poses is None else "triangulate",
             "version": version_of("splatseed"),
             "settings": asdict(settings),

@@ -31,7 +31,7 @@ from splatseed.splat.covisible import find_covisible, pixel_masks
 from splatseed.splat.evaluate import OnView, TrainedModel, evaluate_model, load_model
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.lpips import load_lpips
-from splatseed.text import counted
+from splatseed.text import agreeing, counted
 from splatseed.training.config import (
     has_run_masks,
     has_run_poses,
@@ -203,8 +203,11 @@ def split_findings(model: Path, views: int) -> tuple[Finding, ...]:
                 return (Finding("trained-test-views", text, "error"),)
             if found:
                 return ()
-    text = f"{model} does not record on which photographs it was trained: if these "
-    text += f"{counted(views, 'view')} were among them, its scores are too high."
+    text = f"{model} does not record on which photographs it was trained: if the "
+    text += (
+        f"{counted(views, 'test view')} {agreeing(views, 'was', 'were')} among them, its scores "
+    )
+    text += "are too high."
     return (Finding("unknown-split", text),)
 
 

@@ -145,7 +145,7 @@ class TrainingRun:
             scores = EvalResult(())
             if self._test_views:
                 scores = score(render, self._test_views, on_view=self._draw)
-                self._end_curve(scores, len(world))
+            self._end_curve(scores, len(world))
             result = TrainingResult(
                 dataclasses.replace(scores, num_gaussians=len(world), model_bytes=world.num_bytes),
                 tuple(
@@ -178,9 +178,10 @@ class TrainingRun:
         """Make the curve end with the scores of the model that was written."""
         records = self.state.records
         if records and records[-1].step == self.state.step:
-            records[-1] = records[-1]._replace(
-                test_psnr=scores.psnr, test_ssim=scores.ssim, num_gaussians=num_gaussians
-            )
+            last = records[-1]._replace(num_gaussians=num_gaussians)
+            if scores.per_image:
+                last = last._replace(test_psnr=scores.psnr, test_ssim=scores.ssim)
+            records[-1] = last
 
     def _draw(
         self, view: View, render: Float32[np.ndarray, "H W 3"], errors: Float32[np.ndarray, "H W"]

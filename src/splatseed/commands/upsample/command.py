@@ -268,7 +268,7 @@ def _announce(
         print_note(Finding("unused-options", text))
     how = ""
     if isinstance(method, photo_methods.Stereo) and not photo_methods.has_depth_hints(scene):
-        points = "too few" if photo_methods.has_points(scene) else "no"
+        points = "too few" if len(scene.points) else "no"
         maps = scene.depths if method.depth_maps else None
         where = "" if maps is None else ", around its depth maps"
         how = f": {points} points, so depth is found by comparing photographs{where}"
