@@ -62,10 +62,10 @@ def test_opacities_decay_by_a_factor():
 
 def test_dropout_rises_and_is_less_with_more_photographs():
     ours = make_schedule(STRATEGIES["grow"], 1500, as_3dgs=False)
-    assert [ours.dropout_at(step, 3) for step in (0, 750, 1500)] == [0, 0.3, 0.6]
-    last = [ours.dropout_at(1500, n) for n in (2, 6, 9, 16, 17)]
-    assert last == pytest.approx([0.6, 0.3, 0.2, 0.2, 0])
-    assert [ours.opacity_decay(n) for n in (3, 6, 17)] == pytest.approx([0.002, 0.001, 0])
+    assert [ours.dropout_at(step, 3) for step in (0, 750, 1500)] == pytest.approx([0, 0.4, 0.8])
+    last = [ours.dropout_at(1500, n) for n in (2, 4, 6, 16, 17)]
+    assert last == pytest.approx([0.8, 0.45, 0.2, 0.2, 0])
+    assert [ours.opacity_decay(n) for n in (2, 3, 6, 17)] == pytest.approx([0.002, 0.002, 0.0005, 0])
 
 
 def test_3dgs_regularises_nothing():
