@@ -64,8 +64,8 @@ def test_dropout_rises_and_is_less_with_more_photographs():
     ours = make_schedule(STRATEGIES["grow"], 1500, as_3dgs=False)
     assert [ours.dropout_at(step, 3) for step in (0, 750, 1500)] == pytest.approx([0, 0.4, 0.8])
     last = [ours.dropout_at(1500, n) for n in (2, 4, 6, 16, 17)]
-    assert last == pytest.approx([0.8, 0.45, 0.2, 0.2, 0])
-    assert [ours.opacity_decay(n) for n in (2, 3, 6, 17)] == pytest.approx([0.002, 0.002, 0.0005, 0])
+    assert last == pytest.approx([0.8, 10 / 16, 10 / 36, 0.2, 0])
+    assert [ours.opacity_decay(n) for n in (2, 3, 6, 17)] == pytest.approx([0.002, 0.002, 0.001, 0])
 
 
 def test_3dgs_regularises_nothing():

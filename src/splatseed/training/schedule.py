@@ -57,15 +57,14 @@ MEAN_FROM = 0.8
 MAX_FEW_VIEWS = 16
 """Maximum number of training photographs that count as few: they are fitted by Gaussians that no
 other view confirms. With more photographs, close to each other, dropout loses."""
-DROPOUT, MIN_DROPOUT, FEWEST_VIEWS = 7.2, 0.2, 3
+DROPOUT, DROPOUT_RANGE = 10.0, (0.2, 0.8)
 """With n <= ``MAX_FEW_VIEWS`` training photographs the last step drops ``DROPOUT`` / n^2 of the
-Gaussians, but ``MIN_DROPOUT`` at least; earlier steps drop fewer, linear from 0 at the first.
-Fewer photographs than the third number count as that many. Source: DropGaussian (H. Park et al.,
-2025)."""
-OPACITY_DECAY = 0.018
-"""With these each step lowers all opacities by the fraction ``OPACITY_DECAY`` / n^2, so that
-Gaussians that few pixels need vanish. Source: L. Han et al., Binocular-Guided 3D Gaussian Splatting
-with View Consistency for Sparse View Synthesis (2024)."""
+Gaussians, within the range; earlier steps drop fewer, linear from 0 at the first. Source:
+DropGaussian (H. Park et al., 2025)."""
+OPACITY_DECAY, MAX_DECAY = 0.036, 0.002
+"""With these each step lowers all opacities by the fraction ``OPACITY_DECAY`` / n^2, or
+``MAX_DECAY``, so that Gaussians that few pixels need vanish. Source: L. Han et al.,
+Binocular-Guided 3D Gaussian Splatting with View Consistency for Sparse View Synthesis (2024)."""
 MAX_SIZE = 0.05
 """Maximum initial size of a Gaussian, in min view depths. Where SfM has few points the gaps between
 them are wide, and a Gaussian that fills a gap hides everything behind it."""
@@ -115,17 +114,17 @@ class Schedule:
 
     def dropout_at(self, step: int, num_views: int) -> float:
         """Return the fraction of the Gaussians that a step of a run on these many views drops."""
-        share = self._per_few_views(num_views)
-        return max(MIN_DROPOUT, DROPOUT * share) * step / self.max_steps if share else 0.0
+        if not self._has_few(num_views):
+            return 0.0
+        least, most = DROPOUT_RANGE
+        return max(least, min(DROPOUT / num_views**2, most)) * step / self.max_steps
 
     def opacity_decay(self, num_views: int) -> float:
         """Return the fraction that opacities lose in each step of a run on these many views."""
-        return OPACITY_DECAY * self._per_few_views(num_views)
+        return min(OPACITY_DECAY / num_views**2, MAX_DECAY) if self._has_few(num_views) else 0.0
 
-    def _per_few_views(self, num_views: int) -> float:
-        """Return 1 / n^2, or 0 if views are many or are not regularised."""
-        applies = self.regularizes_few and num_views <= MAX_FEW_VIEWS
-        return 1 / max(num_views, FEWEST_VIEWS) ** 2 if applies else 0.0
+    def _has_few(self, num_views: int) -> bool:
+        return self.regularizes_few and num_views <= MAX_FEW_VIEWS
 
     def rates(self, step: int) -> dict[str, float]:
         """Return the learning rate of each parameter; of positions in size units."""
