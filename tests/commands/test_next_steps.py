@@ -67,7 +67,7 @@ def test_what_info_advises_works(points, bent, tmp_path, monkeypatch, splatseed)
     write_scene(kept, scene, copy_images=True, require_points=False)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(next_steps, "which", lambda _: None)  # as without a GPU
-    run = splatseed("info", scene)
+    run = splatseed("info", scene, "--max-steps", "30000")
     assert run.code == 0, run.err
     wanted = ["train", "train", "upsample", *([] if points else ["sfm"])]
     assert follow(run.out, splatseed) == ["undistort", *wanted]
