@@ -443,13 +443,10 @@ def _confirmed_share(scene: Scene, stereo: StereoResult, seconds: float) -> tupl
     )
     if not odd or median < MIN_MEDIAN_SHARE:
         return (found,)
-    does, its, pose, it = agreeing(
-        len(odd), "does,its,pose is,it shows", "do,their,poses are,they show"
-    ).split(",")
+    count = f"{counted(len(odd), 'photograph')} {agreeing(len(odd), 'does', 'do')}"
     text = (
-        f"{counted(len(odd), 'photograph')} {does} not fit the others, which confirm almost none "
-        f"of {its} depth ({median:.0%} in the median photograph): {name_some(odd)}; {its} "
-        f"{pose} wrong, or {it} other things."
+        f"{count} not fit the others, which confirm almost no depth there ({median:.0%} in the "
+        f"median photograph): {name_some(odd)}. A wrong pose, or another place."
     )
     fix = "`exclude` leaves such photographs out."
     return found, Finding("photographs-disagree", text, subjects=odd, fix=fix)
